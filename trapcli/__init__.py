@@ -1,0 +1,1 @@
+"""trap-motion: the rigid motion of a trapped particle from its video."""

@@ -1,0 +1,69 @@
+"""The `trap-motion` command: subcommands are loaded on use, errors become one line and an exit code."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from typing import Any
+
+import click
+
+from trapcli.errors import TrapError
+
+COMMANDS = ("simulate", "estimate", "compare", "plot", "export", "info")
+INTERRUPTED = 130
+
+
+class LazyGroup(click.Group):
+    """Import a command's module only when it is called, so that ``--help`` answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands in the order of a workflow."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Load ``trapcli.cli.<name>`` and return its ``command``."""
+        if cmd_name not in COMMANDS:
+            return None
+        command = importlib.import_module(f"trapcli.cli.{cmd_name}").command
+        assert isinstance(command, click.Command)
+        return command
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="trapcli", prog_name="trap-motion")
+def cli() -> None:
+    """Recover how a trapped particle moved, from its video alone."""
+
+
+def run(arguments: list[str] | None = None) -> None:
+    """Entry point of ``trap-motion``: run a command, map every failure to the exit codes of the contract."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        code: Any = cli.main(args=arguments, prog_name="trap-motion", standalone_mode=False)
+        sys.stdout.flush()
+    except click.ClickException as error:
+        error.show()
+        code = 2
+    except (click.Abort, KeyboardInterrupt):
+        _say("interrupted")
+        code = INTERRUPTED
+    except TrapError as error:
+        _say(str(error))
+        code = error.exit_code
+    except BrokenPipeError:
+        # the reader (for example `head`) has what it wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _terminate(_signal: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _say(message: str) -> None:
+    one_line = " ".join(message.split())
+    click.echo(f"trap-motion: {one_line}", err=True)

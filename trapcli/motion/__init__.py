@@ -1,0 +1,1 @@
+"""From attenuation to motion, one step of the paper a file."""

@@ -1,0 +1,1 @@
+"""From raw counts to attenuation: background, −log, region of interest."""

@@ -1,0 +1,1 @@
+"""Test objects with closed-form projections, motions and a camera."""

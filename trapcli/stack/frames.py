@@ -1,0 +1,93 @@
+"""`Frames`: a video stack that is read block by block, whatever file it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class StackInfo:
+    """What a file says of itself.
+
+    Attributes
+    ----------
+    source:
+        The paths or the name the frames come from, in words.
+    format:
+        For example ``"ImageJ TIFF, LZW"`` or ``"AVI, MJPG"``.
+    frame_interval:
+        Time between frames in `time_unit`, or None where the file doesn't say.
+    pixel_size:
+        Edge of a (square) pixel in `pixel_unit`, or None where the file doesn't say.
+    bits:
+        Significant bits per pixel where known (12 for 12-in-16-bit data), else the type's.
+    lossy:
+        True where the codec has changed the pixel values.
+    warnings:
+        What the user should know before trusting these frames, one sentence each.
+    """
+
+    source: str = "array"
+    format: str = "array"
+    frame_interval: float | None = None
+    time_unit: str = "s"
+    pixel_size: float | None = None
+    pixel_unit: str | None = None
+    bits: int | None = None
+    lossy: bool = False
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Frames:
+    """N frames of H × W pixels, read in order and block by block; never all at once.
+
+    Attributes
+    ----------
+    shape:
+        ``(N, H, W)``.
+    dtype:
+        Type of the pixels as stored, native byte order.
+    index:
+        ``(N,)`` position of each frame in the input (after `--frames START:STOP:STEP` not 0…N−1).
+    info:
+        What the file says of itself.
+    read_blocks:
+        ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes may be
+        repeated. Raises `InputError` where fewer than N frames can be delivered.
+    """
+
+    shape: tuple[int, int, int]
+    dtype: np.dtype[np.generic]
+    index: NDArray[np.int64]
+    info: StackInfo
+    read_blocks: Callable[[int], Iterator[NDArray[np.generic]]] = field(repr=False)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def blocks(self, size: int | None = None) -> Iterator[NDArray[np.generic]]:
+        """Yield the frames in order as ``(n, H, W)`` blocks of at most `size` frames (default: about 16 MiB)."""
+        if size is None:
+            frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
+            size = max(1, min(len(self), (16 << 20) // max(1, frame_bytes)))
+        return self.read_blocks(size)
+
+    def to_array(self) -> NDArray[np.generic]:
+        """Return all frames as one ``(N, H, W)`` array (for small stacks and tests)."""
+        return np.concatenate(list(self.blocks()))
+
+    @classmethod
+    def from_array(cls, frames: NDArray[np.generic], info: StackInfo | None = None) -> Frames:
+        """Wrap an ``(N, H, W)`` array."""
+
+        def read_blocks(size: int) -> Iterator[NDArray[np.generic]]:
+            for start in range(0, len(frames), size):
+                yield frames[start : start + size]
+
+        n, height, width = frames.shape
+        return cls((n, height, width), frames.dtype, np.arange(n), info or StackInfo(), read_blocks)
