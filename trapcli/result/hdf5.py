@@ -63,8 +63,8 @@ def save(motion: Motion, path: Path, *, overwrite: bool = False) -> None:
 def load(path: Path) -> Motion:
     """Read a result or truth file.
 
-    Frames of a truth file, which has no ``/motion/quality``, are all valid. Nothing is read before its shape is
-    known to be the expected one and to fit into the file and the memory; links out of the file are refused.
+    Frames of a truth file, which has no ``/motion/quality``, are all valid. Nothing is read before its shape
+    is known to be the expected one and to fit into the file and the memory; links out of it are refused.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def load(path: Path) -> Motion:
 
 
 def quaternions(R: Array) -> Array:
-    """Return ``(N, 4)`` quaternions of ``(N, 3, 3)`` rotations: scalar last, signs continuous, NaN stays NaN."""
+    """Return ``(N, 4)`` quaternions of ``(N, 3, 3)`` rotations, scalar last, signs continuous."""
     quaternion = np.full((len(R), 4), np.nan)
     known = np.isfinite(R).all(axis=(1, 2))
     if known.any():
