@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -141,6 +142,11 @@ def _is_hdf5(file: Path) -> bool:
 def _given(options: dict[str, Any]) -> dict[str, Any]:
     tables = ((key, _given(value) if isinstance(value, dict) else value) for key, value in options.items())
     return {key: value for key, value in tables if value is not None}
+
+
+def command_line() -> str:
+    """Return the command line as it would be typed in a shell."""
+    return shlex.join(["trap-motion", *sys.argv[1:]])
 
 
 def print_json(value: Any) -> None:
