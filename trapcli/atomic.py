@@ -13,7 +13,7 @@ from pathlib import Path
 
 from trapcli.errors import OutputError
 
-# the host is part of the name: folders may be shared between machines, whose process numbers mean nothing here
+# the host is part of the name: folders may be shared with machines whose process numbers mean nothing here
 _PREFIX = f".trap-motion-{re.sub(r'[^A-Za-z0-9.]', '_', socket.gethostname())[:64]}-"
 _TEMPORARY = re.compile(re.escape(_PREFIX) + r"(\d+)-[0-9a-f]{8}(\.\w+)?")
 
@@ -29,7 +29,7 @@ def check_output(path: Path | str, overwrite: bool) -> Path:
     Raises
     ------
     OutputError
-        Where `path` exists and `overwrite` is False, isn't a regular file, or its folder is missing or read-only.
+        Where `path` exists and `overwrite` is False, isn't a regular file, or its folder can't be written.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -57,8 +57,7 @@ def atomic_path(path: Path | str, overwrite: bool = False) -> Iterator[Path]:
     """Give a temporary path to write to, which becomes `path` when the body ends well and vanishes otherwise.
 
     The temporary file lies in the folder of `path`, exists (empty), and ends like `path`. Files that killed
-    processes left behind there are removed. Without `overwrite`, a file that appears at `path` meanwhile is left
-    alone.
+    processes left behind there are removed. Without `overwrite`, a file that came to `path` meanwhile stays.
 
     Raises
     ------
@@ -96,7 +95,7 @@ def remove_stale(folder: Path) -> None:
 
 
 def _publish_new(temporary: Path, target: Path) -> None:
-    """Rename unless `target` exists: unlike a rename, a link never replaces what came there since the check."""
+    """Rename unless `target` exists; unlike a rename, a link never replaces what came there meanwhile."""
     try:
         os.link(temporary, target)
     except OSError as error:

@@ -57,8 +57,8 @@ class Frames:
     info:
         What the file says of itself.
     read_blocks:
-        ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes may be
-        repeated. Raises `InputError` where fewer than N frames can be delivered.
+        ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes may
+        be repeated. Raises `InputError` where fewer than N frames can be delivered.
     """
 
     shape: tuple[int, int, int]
@@ -71,7 +71,7 @@ class Frames:
         return self.shape[0]
 
     def blocks(self, size: int | None = None) -> Iterator[NDArray[np.generic]]:
-        """Yield the frames in order as ``(n, H, W)`` blocks of at most `size` frames (default: about 16 MiB)."""
+        """Yield the frames in order as ``(n, H, W)`` blocks of at most `size` frames (default: 16 MiB)."""
         if size is None:
             frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
             size = max(1, min(len(self), (16 << 20) // max(1, frame_bytes)))
