@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +58,8 @@ class Frames:
     info:
         What the file says of itself.
     read_blocks:
-        ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes may
-        be repeated. Raises `InputError` where fewer than N frames can be delivered.
+        ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes
+        may be repeated. Raises `InputError` where fewer than N frames can be delivered.
     """
 
     shape: tuple[int, int, int]
@@ -91,3 +92,17 @@ class Frames:
 
         n, height, width = frames.shape
         return cls((n, height, width), frames.dtype, np.arange(n), info or StackInfo(), read_blocks)
+
+
+def single_frames(
+    blocks: Iterable[NDArray[Any]], shape: tuple[int, int, int], dtype: np.dtype[Any]
+) -> Iterator[NDArray[Any]]:
+    """Yield the frames of `blocks` one by one, and insist on N of them."""
+    count = 0
+    for block in blocks:
+        if block.shape[1:] != shape[1:] or block.dtype != dtype:
+            raise ValueError(f"block of {block.shape}, {block.dtype} in a stack of {shape}, {dtype}")
+        yield from block
+        count += len(block)
+    if count != shape[0]:
+        raise ValueError(f"{count} frames in a stack of {shape[0]}")

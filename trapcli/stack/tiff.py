@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import tifffile
 from numpy.typing import DTypeLike, NDArray
 
 from trapcli.atomic import atomic_path
+from trapcli.stack.frames import single_frames
 from trapcli.stack.metadata import OME_LENGTH_UNITS, escape_ascii
 
 CLASSIC_TIFF_LIMIT = 3_900_000_000
@@ -76,20 +77,6 @@ def write_tiff(
             photometric="minisblack",
             **describe(shape, frame_interval, pixel_size, pixel_unit),
         )
-
-
-def single_frames(
-    blocks: Iterable[NDArray[Any]], shape: tuple[int, int, int], dtype: np.dtype[Any]
-) -> Iterator[NDArray[Any]]:
-    """Yield the frames of `blocks` one by one, and insist on N of them."""
-    count = 0
-    for block in blocks:
-        if block.shape[1:] != shape[1:] or block.dtype != dtype:
-            raise ValueError(f"block of {block.shape}, {block.dtype} in a stack of {shape}, {dtype}")
-        yield from block
-        count += len(block)
-    if count != shape[0]:
-        raise ValueError(f"{count} frames in a stack of {shape[0]}")
 
 
 def _imagej_arguments(
