@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from trapcli.result.motion import Flag, Motion
+from trapcli.result.motion import Motion
 
 Array = NDArray[np.float64]
 
-ROTATION_TOLERANCE = 1e-13
+ROTATION_TOLERANCE = 1e-12
 """Largest change of an entry of R when the steps of the integration are halved."""
 
 ALPHA_ZERO = 1e-6
@@ -92,8 +92,7 @@ def integrate(motion: RigidMotion, t: Array) -> Array:
     while steps < 1024:
         steps *= 2
         R, coarse = _magnus(motion, t, steps), R
-        # the method gains a factor of 64 for each halving
-        if np.max(np.abs(R - coarse), initial=0.0) < 64 * ROTATION_TOLERANCE:
+        if np.max(np.abs(R - coarse)) < ROTATION_TOLERANCE:
             break
     return R
 
@@ -104,7 +103,8 @@ def _magnus(motion: RigidMotion, t: Array, steps: int) -> Array:
     node = np.sqrt(15.0) / 10
     # (Rᵀ)' = -[ω]× Rᵀ is the linear equation of the method, and [a×b]× the commutator of [a]× and [b]×
     a1, a2, a3 = (
-        -motion.omega((start + h[..., 0] * (0.5 + c)).ravel()).reshape(*start.shape, 3) for c in (-node, 0.0, node)
+        -motion.omega((start + h[..., 0] * (0.5 + c)).ravel()).reshape(*start.shape, 3)
+        for c in (-node, 0.0, node)
     )
     b1 = h * a2
     b2 = h * np.sqrt(15.0) / 3 * (a3 - a1)
@@ -349,7 +349,6 @@ def true_motion(
         if half_turns % 2:
             mirror = np.array([1.0, 1.0, -1.0])
             R = R * np.outer(mirror, mirror)
-    flags = np.where(defined, 0, Flag.ALPHA_ZERO).astype(np.uint16)
     unknown = np.full(n, np.nan)
     return Motion(
         time=time,
@@ -366,8 +365,9 @@ def true_motion(
         alpha_errors=unknown,
         R_errors=np.full((n, 3), np.nan),
         valid=np.ones(n, np.uint8),
-        flags=flags,
+        flags=np.zeros(n, np.uint16),
         residual=unknown,
         time_unit=time_unit,
         length_unit=length_unit,
+        truth=True,
     )
