@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import json
 import math
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator
@@ -147,6 +148,32 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 def command_line() -> str:
     """Return the command line as it would be typed in a shell."""
     return shlex.join(["trap-motion", *sys.argv[1:]])
+
+
+def refuse_input(output: Path, *inputs: Path) -> None:
+    """Refuse to write onto a file that is read, also under another name.
+
+    Raises
+    ------
+    OutputError
+        Where `output` is one of `inputs`.
+    """
+    from trapcli.errors import OutputError
+
+    for path in inputs:
+        if output.exists() and path.exists() and output.samefile(path):
+            raise OutputError(f"{output}: is an input; choose another name")
+
+
+def print_path(path: Path) -> None:
+    """Print a path on stdout, byte for byte as the file system has it."""
+    click.echo(os.fsencode(path))
+
+
+def print_text(text: str) -> None:
+    """Print text on stdout; what its encoding lacks becomes a question mark."""
+    encoding = sys.stdout.encoding or "utf-8"
+    click.echo(text.encode(encoding, "replace").decode(encoding))
 
 
 def print_json(value: Any) -> None:

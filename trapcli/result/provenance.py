@@ -41,8 +41,8 @@ def collect(
     Returns
     -------
     dict
-        ``program``, ``version``, ``date`` (UTC, ISO 8601), ``command_line``, ``configuration``, ``inputs`` (one
-        line a file, as ``sha256sum`` writes and checks them) and ``libraries`` (one line each).
+        ``program``, ``version``, ``date`` (UTC, ISO 8601), ``command_line``, ``configuration``, ``inputs``
+        (one line a file, as ``sha256sum`` writes and checks them) and ``libraries`` (one line each).
 
     Raises
     ------
