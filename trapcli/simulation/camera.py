@@ -1,4 +1,4 @@
-"""From attenuation to the pixel values of a file: plain attenuation with white noise, or a camera's raw intensities."""
+"""From attenuation to pixel values: plain attenuation with white noise, or a camera's raw intensities."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from trapcli.simulation.config import CameraConfig
 
 Array = NDArray[np.float64]
-Image = NDArray[np.generic]
+Image = NDArray[Any]
 
 BRIGHTNESS = 0.8
-"""Mean brightness of the empty field's centre as a share of the full well, so that flicker doesn't saturate."""
+"""Brightness of the empty field's centre as a share of the full well, so that flicker doesn't saturate."""
 
 _HEADROOM = 1.1
 """Highest attenuation that integers hold, in peaks: the peak of a phantom is an estimate."""
@@ -97,7 +97,7 @@ class Attenuation(Sensor):
 
 @dataclass(frozen=True)
 class Camera(Sensor):
-    """Raw intensities I₀(x) f(t) exp(−s J) of a camera with shot noise, read noise, and a finite number of bits.
+    """Raw intensities I₀(x) f(t) exp(−s J) with shot noise, read noise and a finite number of bits.
 
     Attributes
     ----------
@@ -133,7 +133,7 @@ class Camera(Sensor):
 
     @cached_property
     def flat_field(self) -> Array:
-        """``(H, W)`` illumination I₀ [electrons]: bright in the middle, darker in the corners and under specks."""
+        """``(H, W)`` illumination I₀ [electrons], darker in the corners and under specks."""
         height, width = self.shape
         row = np.arange(height)[:, None] - height // 2
         column = np.arange(width)[None, :] - width // 2

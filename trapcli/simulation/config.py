@@ -69,7 +69,7 @@ class MotionConfig:
     kind: str = "paper"
     """``paper``, ``tumbling``, ``single-axis``, ``paper-special``, ``degenerate-third`` or ``still``."""
     total_angle: float = 240.0
-    """Angle turned in all [degrees] by ``tumbling``, ``paper-special`` and the tumbling of ``degenerate-third``."""
+    """Angle turned in all [degrees] by ``tumbling``, ``paper-special`` and, outside, ``degenerate-third``."""
     turns: float = 1.2
     """Turns about the axis of ``single-axis`` and ``degenerate-third``."""
     azimuth: float = 30.0
@@ -98,7 +98,7 @@ class CameraConfig:
     output: str = "attenuation"
     """``attenuation``: the projections themselves; ``camera``: raw intensities, I₀ · flicker · exp(−s J)."""
     dtype: str = "float32"
-    """Type of the pixels for ``attenuation``; integers span the range of the attenuation. Not for ``camera``."""
+    """Type of the pixels for ``attenuation``; integers span its range. Not for ``camera``."""
     noise: float = 0.0
     """Standard deviation of white noise over the peak attenuation. Only for ``attenuation``."""
     bits: int = 12
@@ -138,7 +138,7 @@ class CameraConfig:
 
 @dataclass(frozen=True)
 class SimulateConfig:
-    """All of ``trap-motion simulate``; without any change the paper's example at a size that runs in seconds."""
+    """All of ``trap-motion simulate``; by default the paper's example at a size that runs in seconds."""
 
     seed: int = 0
     """Seed of everything random; the same seed gives the same stack."""

@@ -1,4 +1,4 @@
-"""Rigid motions to simulate: ω(t), T(t) and the rotations R(t) that follow from RᵀR' = [ω]× (``eqDefOmega``)."""
+"""Rigid motions to simulate: ω(t), T(t), and R(t), which follows from RᵀR' = [ω]× (``eqDefOmega``)."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ class RigidMotion(ABC):
         return self.drift(t)
 
     def rotations(self, t: Array) -> Array:
-        """Return R(t), ``(N, 3, 3)``, at ``(N,)`` ascending times; R = 1 at the first, exact to about 1e-12."""
+        """Return ``(N, 3, 3)`` rotations at ``(N,)`` ascending times, 1 at the first."""
         return integrate(self, t)
 
 
 def integrate(motion: RigidMotion, t: Array) -> Array:
     """Integrate RᵀR' = [ω]× from R = 1 at ``t[0]``.
 
-    Each interval of `t` is cut into steps of the sixth-order Magnus method (three Gauss–Legendre nodes); the steps are halved
-    until R no longer changes.
+    Each interval of `t` is cut into steps of the sixth-order Magnus method (three Gauss–Legendre nodes), which are
+    halved until R no longer changes.
 
     Returns
     -------
@@ -141,8 +141,8 @@ class PaperMotion(RigidMotion):
 class PaperSpecial(RigidMotion):
     """Constant α and ω₃ = −σ: the paper's example of a motion that its method can't recover.
 
-    R(t) = exp(α t [v(0)]×) exp(ω₃ t [e₃]×). The matrix printed in the paper has the second row's sign reversed (its
-    determinant is −1); this is the rotation that solves ``eqDefOmega``.
+    R(t) = exp(α t [v(0)]×) exp(ω₃ t [e₃]×) solves ``eqDefOmega``. The matrix printed in the paper is no
+    rotation: the sign of its second row is reversed, and its determinant is −1.
     """
 
     alpha: float = 4.0
@@ -212,7 +212,7 @@ class SingleAxis(RigidMotion):
         unevenness: float = 0.3,
         drift: Drift | None = None,
     ) -> SingleAxis:
-        """Return `turns` turns in `duration` about the axis at `azimuth` in the image, tilted out of it (both in degrees)."""
+        """Return `turns` in `duration`; `azimuth` and `tilt` turn the axis in and out of the image [°]."""
         a, e = np.deg2rad([azimuth, tilt])
         axis = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         return cls(
@@ -320,8 +320,8 @@ def true_motion(
 ) -> Motion:
     """Sample a motion as the truth of a stack, in the gauge of the result file.
 
-    R = 1 and T = 0 at the first frame; of the two mirror solutions the one with φ in [0, π) at the first frame that has a φ;
-    φ is continuous from there on.
+    R = 1 and T = 0 at the first frame; of the two mirror solutions the one with φ in [0, π) at the first
+    frame that has a φ; φ is continuous from there on.
 
     Parameters
     ----------

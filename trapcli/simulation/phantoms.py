@@ -1,8 +1,8 @@
 """Test objects whose projections are known in closed form, at any orientation.
 
-All follow ``eq:affine`` and ``eq:J``: an object point y is seen at the lab point x with y = C₃ + R (x − C₃ + T), that is
-x = Rᵀ(y − C₃) + C₃ − T. A quadratic form A of the object becomes M = RᵀAR in the lab, and its integral along x₃ follows by
-completing the square in x₃.
+All follow ``eq:affine`` and ``eq:J`` of Elbau et al. 2020, Inverse Problems 36: an object point y is seen at
+the lab point x with y = C₃ + R (x − C₃ + T), that is x = Rᵀ(y − C₃) + C₃ − T. A quadratic form A of the object
+becomes M = RᵀAR in the lab, and integrals along x₃ follow by completing the square in x₃.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 NEGLIGIBLE = 1e-6
 """Share of the highest density below which smooth objects count as ended (`Phantom.radius`)."""
 
-# exp(-50) is 2e-22: times the paper's polynomial of degree 6 still nothing against a double of the image's centre
+# exp(-50) is 2e-22, which even times the paper's polynomial is below the rounding of the image
 _GAUSSIAN_END = 50.0
 
 
@@ -67,7 +67,7 @@ class Phantom(ABC):
 
     @cached_property
     def peak(self) -> float:
-        """Highest attenuation in the projections along 32 directions, a good estimate of the highest of all."""
+        """Highest attenuation in the projections along 32 directions, an estimate of the highest of all."""
         x = np.linspace(-self.radius, self.radius, 97)
         centred = self.center * np.array([1.0, 1.0, 0.0])
         views = Rotation.random(32, rng=np.random.default_rng(0)).as_matrix()
@@ -82,9 +82,9 @@ class Phantom(ABC):
 class PaperPhantom(Phantom):
     """The paper's attenuation coefficient u(x) = Π |x − P_i|² exp(−|Dx|²/4) (``eq:defnumericsattcoeff``).
 
-    In the lab the factors are |x − X_i|² with X_i the lab positions of P_i. Along a ray u is a polynomial of degree 6 times a
-    Gaussian, so Gauss–Hermite quadrature with four nodes is exact. Every node adds a polynomial of degree 6 in (x1, x2), so
-    the whole image is one such polynomial times one two-dimensional Gaussian.
+    In the lab the factors are |x − X_i|² with X_i the lab positions of P_i. Along a ray u is a polynomial of
+    degree 6 times a Gaussian, so Gauss–Hermite quadrature with four nodes is exact. Every node adds a
+    polynomial of degree 6 in (x1, x2): the image is one such polynomial times one two-dimensional Gaussian.
     """
 
     points: Array = np.array([[1.0, 0.5, -1.0], [-0.5, 1.0, 1.0], [0.0, -1.0, 0.5]])
@@ -102,14 +102,17 @@ class PaperPhantom(Phantom):
 
     @property
     def center(self) -> Array:
+        """Centre C₃."""
         return self._moments[1]
 
     @property
     def mass(self) -> float:
+        """∫ u dx."""
         return self._moments[0]
 
     @cached_property
     def radius(self) -> float:
+        """Radius of the support."""
         r = np.linspace(0.0, 20.0, 401)
         directions = Rotation.random(500, rng=np.random.default_rng(0)).as_matrix()[:, 2]
         values = self.density(self.center + r[:, None, None] * directions).max(axis=1)
@@ -121,10 +124,12 @@ class PaperPhantom(Phantom):
         return product
 
     def density(self, points: Array) -> Array:
+        """Return u at ``(..., 3)`` points."""
         gauss: Array = np.exp(-0.25 * np.sum((points * self.diagonal) ** 2, axis=-1))
         return self._polynomial(points) * gauss
 
     def project(self, R: Array, T: Array, x1: Array, x2: Array) -> Array:
+        """Return the ``(H, W)`` projection (``eq:J``)."""
         origin, *points = self._lab(np.vstack([np.zeros(3), self.points]), R, T)
         form, slope, along = _complete_square(R.T @ np.diag(self.diagonal**2) @ R)
         nodes, weights = np.polynomial.hermite.hermgauss(4)
@@ -142,7 +147,7 @@ def _complete_square(M: Array) -> tuple[Array, Array, float]:
 
 
 def _product_coefficients(points: Array, slope: Array, nodes: Array) -> Array:
-    """Coefficients ``[node, power of x1, power of x2]`` of Π |x − X_i|² on the surfaces x₃ = node − ⟨slope, (x1, x2)⟩."""
+    """Coefficients [node, power of x1, power of x2] of Π |x − X_i|² at x₃ = node − ⟨slope, (x1, x2)⟩."""
     product = np.ones((len(nodes), 1, 1))
     l1, l2 = slope
     for x1, x2, x3 in points:
@@ -206,7 +211,7 @@ class Blobs(Phantom):
     def random(
         cls, rng: np.random.Generator, *, count: int = 12, radius: float = 5.0, anisotropic: bool = True
     ) -> Blobs:
-        """Return blobs without symmetry, of sizes 1 to 2.5, centred at 0 and filling the given support radius."""
+        """Return blobs of different sizes without symmetry, centred at 0 and filling the support radius."""
         position = _in_ball(rng, count)
         sigma = rng.uniform(0.12, 0.3, count)
         stretch = rng.uniform(0.6, 1.0, (count, 3)) if anisotropic else np.ones((count, 3))
@@ -241,25 +246,31 @@ class Blobs(Phantom):
 
     @cached_property
     def center(self) -> Array:
-        return self._masses @ self.position / self._masses.sum()
+        """Centre C₃."""
+        center: Array = self._masses @ self.position / self._masses.sum()
+        return center
 
     @property
     def mass(self) -> float:
+        """∫ u dx."""
         return float(self._masses.sum())
 
     @cached_property
     def radius(self) -> float:
+        """Radius of the support."""
         widest = np.sqrt(np.linalg.eigvalsh(self.covariance)[:, -1])
         reach = np.sqrt(-2 * np.log(NEGLIGIBLE)) * widest
         return float(np.max(np.linalg.norm(self.position - self.center, axis=1) + reach))
 
     def density(self, points: Array) -> Array:
+        """Return u at ``(..., 3)`` points."""
         d = points[..., None, :] - self.position
         exponent = -0.5 * np.einsum("...bi,bij,...bj->...b", d, np.linalg.inv(self.covariance), d)
         values: Array = np.exp(exponent) @ self.amplitude
         return values
 
     def project(self, R: Array, T: Array, x1: Array, x2: Array) -> Array:
+        """Return the ``(H, W)`` projection (``eq:J``)."""
         image = np.zeros((len(x2), len(x1)))
         position = self._lab(self.position, R, T)
         # the marginal of a Gaussian along x3 keeps its covariance in (x1, x2)
@@ -269,7 +280,7 @@ class Blobs(Phantom):
             variance = planar[:, 0, 0, None]
             along_x1 = np.exp(-((x1 - position[:, :1]) ** 2) / (2 * variance))
             along_x2 = np.exp(-((x2 - position[:, 1:2]) ** 2) / (2 * variance))
-            image = (height[:, None] * along_x2).T @ along_x1
+            image += (height[:, None] * along_x2).T @ along_x1
             return image
         for value, (c1, c2, _), S in zip(height, position, planar, strict=True):
             image += _gaussian_image(np.array([[value]]), 0.5 * np.linalg.inv(S), x1 - c1, x2 - c2)
@@ -304,7 +315,7 @@ class Blobs(Phantom):
 
 @dataclass(frozen=True, eq=False)
 class Grain(Phantom):
-    """A sum of solid ellipsoids with the sharp edges of real grains, u(x) = Σ ρ_e [(x − c_e)ᵀ A_e (x − c_e) ≤ 1].
+    """A sum of solid ellipsoids with sharp edges, u(x) = Σ ρ_e where (x − c_e)ᵀ A_e (x − c_e) ≤ 1.
 
     Attributes
     ----------
@@ -315,7 +326,7 @@ class Grain(Phantom):
     form:
         ``(E, 3, 3)`` symmetric positive matrices A_e [1 / length²].
     oversampling:
-        Points per pixel edge that are averaged, as the area of a camera's pixel does; 1 samples at pixel centres.
+        Points per pixel edge that are averaged, as a camera's pixel does; 1 samples at pixel centres.
     """
 
     step: Array
@@ -327,7 +338,7 @@ class Grain(Phantom):
     def random(
         cls, rng: np.random.Generator, *, count: int = 0, radius: float = 5.0, oversampling: int = 2
     ) -> Grain:
-        """Return a grain without symmetry: a wall of uneven thickness, a lighter inside, and `count` inclusions (0: 4 to 8)."""
+        """Return a grain without symmetry: a wall of uneven thickness and `count` inclusions (0: 4 to 8)."""
         count = count or int(rng.integers(4, 9))
         semi_axes = np.array([1.0, rng.uniform(0.8, 0.9), rng.uniform(0.65, 0.78)])
         inner = semi_axes - rng.uniform(0.08, 0.14)
@@ -361,24 +372,30 @@ class Grain(Phantom):
 
     @cached_property
     def center(self) -> Array:
-        return self._masses @ self.position / self._masses.sum()
+        """Centre C₃."""
+        center: Array = self._masses @ self.position / self._masses.sum()
+        return center
 
     @property
     def mass(self) -> float:
+        """∫ u dx."""
         return float(self._masses.sum())
 
     @cached_property
     def radius(self) -> float:
+        """Radius of the support."""
         longest = np.linalg.eigvalsh(self.form)[:, 0] ** -0.5
         return float(np.max(np.linalg.norm(self.position - self.center, axis=1) + longest))
 
     def density(self, points: Array) -> Array:
+        """Return u at ``(..., 3)`` points."""
         d = points[..., None, :] - self.position
         inside = np.einsum("...ei,eij,...ej->...e", d, self.form, d) <= 1.0
         values: Array = inside @ self.step
         return values
 
     def project(self, R: Array, T: Array, x1: Array, x2: Array) -> Array:
+        """Return the ``(H, W)`` projection (``eq:J``)."""
         n = self.oversampling
         if n > 1:
             fine = self._sample(R, T, _subdivided(x1, n), _subdivided(x2, n))

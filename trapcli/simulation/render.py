@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trapcli.config import to_toml
+from trapcli.config import from_dict, merge, to_toml
 from trapcli.errors import ConfigError
 from trapcli.result.motion import Motion
 from trapcli.simulation.camera import Attenuation, Camera, Image, Sensor
@@ -33,7 +34,7 @@ Array = NDArray[np.float64]
 BACKGROUND_FRAMES = 64
 """Empty frames averaged into the background."""
 
-# one independent stream of random numbers for each part, so that changing one part leaves the others as they are
+# one stream of random numbers for each part, so that a change of one leaves the others as they are
 _PHANTOM, _MOTION, _DRIFT, _SPECKS, _FRAME, _EMPTY_FRAME = range(6)
 
 
@@ -70,7 +71,8 @@ class Scene:
     @property
     def time(self) -> Array:
         """``(N,)`` time of each frame [s]."""
-        return np.arange(self.config.stack.frames) * self.config.stack.frame_interval
+        time: Array = np.arange(self.config.stack.frames, dtype=np.float64) * self.config.stack.frame_interval
+        return time
 
     @property
     def x1(self) -> Array:
@@ -158,8 +160,36 @@ class Scene:
         return (total / BACKGROUND_FRAMES).astype(np.float32)
 
 
+def simulate(config: SimulateConfig | None = None, **overrides: Any) -> tuple[Image, Motion]:
+    """Render a stack and its true motion.
+
+    Parameters
+    ----------
+    config:
+        What to render; by default the paper's phantom and motion, 200 frames of 128 × 128.
+    **overrides:
+        Fields of `SimulateConfig` that differ from it; tables as dictionaries, for example
+        ``simulate(seed=3, stack={"frames": 50}, phantom={"kind": "grain"})``.
+
+    Returns
+    -------
+    frames:
+        ``(N, H, W)`` array; for stacks that don't fit into memory use ``Scene.from_config(config).frames()``.
+    motion:
+        The truth in the gauge of the result file; times in s, lengths in the configuration's `pixel_unit`.
+
+    Raises
+    ------
+    ConfigError
+        For an unknown field or a value that makes no sense.
+    """
+    table = asdict(config or SimulateConfig())
+    scene = Scene.from_config(from_dict(SimulateConfig, merge(table, overrides), "simulate"))
+    return scene.frames().to_array(), scene.truth()
+
+
 def _coordinates(count: int, spacing: float) -> Array:
-    x: Array = (np.arange(count) - count // 2) * spacing
+    x: Array = (np.arange(count, dtype=np.float64) - count // 2) * spacing
     return x
 
 
