@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import sys
@@ -136,7 +137,7 @@ def command(
     )
     replace(motion, provenance=motion.provenance | origin).save(paths[1], overwrite=overwrite)
     for path in paths:
-        click.echo(path)
+        click.echo(os.fsencode(path))
 
 
 def _outputs(output: Path, truth: Path | None, background: Path | None, overwrite: bool) -> list[Path]:

@@ -19,7 +19,7 @@ BRIGHTNESS = 0.8
 """Brightness of the empty field's centre as a share of the full well, so that flicker doesn't saturate."""
 
 _HEADROOM = 1.1
-"""Highest attenuation that integers hold, in peaks: the peak of a phantom is an estimate."""
+"""Highest attenuation that integers hold, in peaks: the peak is an estimate from some frames."""
 _PEDESTAL = 5.0
 """Value of zero attenuation in noisy integers, in standard deviations, so that no noise is cut off at 0."""
 

@@ -79,8 +79,8 @@ class RigidMotion(ABC):
 def integrate(motion: RigidMotion, t: Array) -> Array:
     """Integrate RᵀR' = [ω]× from R = 1 at ``t[0]``.
 
-    Each interval of `t` is cut into steps of the sixth-order Magnus method (three Gauss–Legendre nodes), which are
-    halved until R no longer changes.
+    Each interval of `t` is cut into steps of the sixth-order Magnus method (three Gauss–Legendre nodes). They
+    are halved until R no longer changes.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Test objects whose projections are known in closed form, at any orientation.
 
 All follow ``eq:affine`` and ``eq:J`` of Elbau et al. 2020, Inverse Problems 36: an object point y is seen at
-the lab point x with y = C₃ + R (x − C₃ + T), that is x = Rᵀ(y − C₃) + C₃ − T. A quadratic form A of the object
-becomes M = RᵀAR in the lab, and integrals along x₃ follow by completing the square in x₃.
+the lab point x with y = C₃ + R (x − C₃ + T), that is x = Rᵀ(y − C₃) + C₃ − T. A quadratic form A of the
+object becomes M = RᵀAR in the lab, and integrals along x₃ follow by completing the square in x₃.
 """
 
 from __future__ import annotations
@@ -64,14 +64,6 @@ class Phantom(ABC):
         Array
             ``(H, W)`` image J(x1, x2) = ∫ u(C₃ + R (x − C₃ + T)) dx₃.
         """
-
-    @cached_property
-    def peak(self) -> float:
-        """Highest attenuation in the projections along 32 directions, an estimate of the highest of all."""
-        x = np.linspace(-self.radius, self.radius, 97)
-        centred = self.center * np.array([1.0, 1.0, 0.0])
-        views = Rotation.random(32, rng=np.random.default_rng(0)).as_matrix()
-        return max(float(self.project(R, centred, x, x).max()) for R in views)
 
     def _lab(self, points: Array, R: Array, T: Array) -> Array:
         """Lab positions of ``(n, 3)`` object points."""

@@ -33,6 +33,8 @@ Array = NDArray[np.float64]
 
 BACKGROUND_FRAMES = 64
 """Empty frames averaged into the background."""
+PEAK_FRAMES = 64
+"""Frames that tell the peak of the attenuation."""
 
 # one stream of random numbers for each part, so that a change of one leaves the others as they are
 _PHANTOM, _MOTION, _DRIFT, _SPECKS, _FRAME, _EMPTY_FRAME = range(6)
@@ -85,13 +87,20 @@ class Scene:
         return _coordinates(self.config.stack.height, self.config.stack.pixel_size)
 
     @cached_property
+    def peak(self) -> float:
+        """Highest attenuation in the stack, judged by at most `PEAK_FRAMES` of its frames."""
+        n = self.config.stack.frames
+        chosen = np.unique(np.linspace(0, n - 1, min(n, PEAK_FRAMES)).astype(int))
+        return max(float(self.attenuation(int(i)).max()) for i in chosen)
+
+    @cached_property
     def sensor(self) -> Sensor:
         """What turns attenuation into pixel values."""
         config, stack = self.config.camera, self.config.stack
         if config.output == "attenuation":
-            return Attenuation(config, self.phantom.peak)
+            return Attenuation(config, self.peak)
         specks = np.random.SeedSequence(self.config.seed, spawn_key=(_SPECKS,))
-        return Camera(config, self.phantom.peak, (stack.height, stack.width), specks)
+        return Camera(config, self.peak, (stack.height, stack.width), specks)
 
     @cached_property
     def _truth(self) -> Motion:
