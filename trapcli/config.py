@@ -33,7 +33,9 @@ class InputConfig:
     roi: tuple[int, ...] = ()
     """Rows and columns to keep: (top, bottom, left, right); empty for all."""
     channel: int | None = None
-    """Channel of a colour or multi-channel input."""
+    """Channel of a colour or multi-channel input, counted from 0."""
+    time_axis: str = ""
+    """Axis that is time where a file has several, such as T or Z; TZ for all frames of both, in stored order."""
     dataset: str = ""
     """Path of the dataset inside an HDF5 or Zarr input."""
     frame_interval: float | None = None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 import uuid
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,27 @@ import tifffile
 from numpy.typing import DTypeLike, NDArray
 
 from trapcli.atomic import atomic_path
-from trapcli.stack.frames import single_frames
-from trapcli.stack.metadata import OME_LENGTH_UNITS, escape_ascii
+from trapcli.config import InputConfig
+from trapcli.errors import InputError
+from trapcli.stack.axes import frame_planes
+from trapcli.stack.frames import StackInfo, single_frames
+from trapcli.stack.ifd import Chain, Page, read_chain
+from trapcli.stack.metadata import (
+    OME_LENGTH_UNITS,
+    Calibration,
+    escape_ascii,
+    imagej_calibration,
+    ome_calibration,
+    ome_sizes,
+)
+from trapcli.stack.planes import PlaneReader, Segments
+from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, guard
 
 CLASSIC_TIFF_LIMIT = 3_900_000_000
 """Bytes of pixels above which a BigTIFF is written; offsets in a classic TIFF end at 4 GiB."""
+
+_LOSSY = (6, 7, 33004, 33007, 34892)
+_PERHAPS_LOSSY = (22610, 33003, 33005, 34712, 34887, 34934, 48124, 50001, 50002, 52546)
 
 # TIFF stores a resolution as a ratio of two 32-bit integers, which is exact enough only in between
 _RATIONAL_PIXEL_SIZES = (1e-4, 1e4)
@@ -116,3 +135,260 @@ def _ome_arguments(
     # the same data give the same bytes
     metadata["UUID"] = str(uuid.uuid5(uuid.NAMESPACE_OID, f"{shape} {metadata}"))
     return {"metadata": metadata}
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The planes of a stack in stored order, their axes, and the page that says how all are stored."""
+
+    page: tifffile.TiffPage
+    axes: str
+    sizes: tuple[int, ...]
+    planes: list[Segments]
+    warnings: tuple[str, ...] = ()
+
+
+def open_tiff(path: Path, name: str, config: InputConfig) -> Source:
+    """Open a TIFF stack: plain, ImageJ, OME, BigTIFF, and the dialects of microscopes that tifffile knows.
+
+    Parameters
+    ----------
+    name:
+        What messages call the input.
+    config:
+        Its `time_axis`, `channel` and `allow_partial` are used here.
+
+    Raises
+    ------
+    InputError
+        Where the file is truncated, damaged or of a kind that isn't read, or no axis is clearly time.
+    """
+    with guard(name):
+        chains = _Chains(name)
+        chain = chains.chain(path)
+        if not chain.pages or (chain.fault and not config.allow_partial):
+            raise InputError(f"{name}: truncated or damaged: {chain.fault}; {PARTIAL_HINT}")
+    with guard(name, strict=not config.allow_partial) as log, tifffile.TiffFile(path) as tiff:
+        layout = _whole_or_part(name, tiff, chains, config.allow_partial)
+        table, doubts = frame_planes(
+            name, layout.axes, layout.sizes, time_axis=config.time_axis, channel=config.channel
+        )
+        reader = PlaneReader(name, layout.page, layout.planes)
+        info = _info(name, tiff, layout.page, (*layout.warnings, *doubts, *log.warnings))
+    frames, channels = table.shape
+    if channels > 1 and reader.samples > 1:
+        raise InputError(f"{name}: has colours and {channels} channels; save the wanted channel alone")
+
+    def read(index: NDArray[np.int64], channel: int | None) -> Iterator[NDArray[Any]]:
+        with reader.session() as plane:
+            for positions in table[index]:
+                if channels == 1:
+                    pixels = plane(positions[0])
+                    yield pixels if channel is None else pixels[..., channel]
+                elif channel is not None:
+                    yield plane(positions[channel])
+                else:
+                    yield np.stack([plane(position).copy() for position in positions], axis=-1)
+
+    shape = (frames, reader.height, reader.width)
+    return Source(name, shape, reader.dtype, max(channels, reader.samples), info, read)
+
+
+class _Chains:
+    """The page directories of the files of a stack, each read once."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._chains: dict[Path, Chain] = {}
+        self._pages: dict[tuple[Path, int], Page] = {}
+
+    def chain(self, path: Path) -> Chain:
+        if path not in self._chains:
+            with path.open("rb") as file:
+                self._chains[path] = read_chain(file)
+            self._pages |= {(path, page.offset): page for page in self._chains[path].pages}
+        return self._chains[path]
+
+    def page(self, path: Path, offset: int) -> Page:
+        chain = self.chain(path)
+        if (path, offset) not in self._pages:
+            reason = chain.fault or f"no page starts at {offset}"
+            raise InputError(f"{self._name}: {path.name} is truncated or damaged: {reason}; {PARTIAL_HINT}")
+        return self._pages[path, offset]
+
+
+def _whole_or_part(name: str, tiff: tifffile.TiffFile, chains: _Chains, allow_partial: bool) -> _Layout:
+    chain = chains.chain(Path(tiff.filehandle.path))
+    if allow_partial and chain.fault:
+        return _salvaged(name, tiff, chain)
+    try:
+        with guard(name):
+            return _layout(name, tiff, chains)
+    except InputError:
+        if not allow_partial:
+            raise
+        return _salvaged(name, tiff, chain)
+
+
+def _layout(name: str, tiff: tifffile.TiffFile, chains: _Chains) -> _Layout:
+    """Take what tifffile makes of the file, after checking it against what is there."""
+    if len(tiff.series) != 1:
+        kinds = ", ".join("x".join(map(str, series.shape)) for series in tiff.series[:4]) or "none"
+        raise InputError(f"{name}: its pages change size or type ({kinds}); save the wanted ones alone")
+    series = tiff.series[0]
+    page = series.keyframe
+    _check_page(name, page)
+    axes, sizes = _plane_axes(name, series)
+    count = math.prod(sizes)
+    path = Path(tiff.filehandle.path)
+    chain = chains.chain(path)
+    if series.dataoffset is None:
+        planes = _listed_planes(name, series, chains)
+    else:
+        planes = _adjacent_planes(path, series.dataoffset, page.nbytes, count, chain.size)
+        end = series.dataoffset + count * page.nbytes
+        within = [p for p in chain.pages if len(p.offsets) and series.dataoffset <= p.offsets[0] < end]
+        _check_alike(name, chains.page(path, page.offset), within)
+    declared = max(count, _declared_images(tiff, page))
+    if len(planes) < declared:
+        raise InputError(
+            f"{name}: truncated: it declares {declared} frames and has {len(planes)}; {PARTIAL_HINT}"
+        )
+    surplus = len(chain.pages) - count
+    warnings = (f"it has {surplus} pages more than its description counts, which aren't read",)
+    return _Layout(page, axes, sizes, planes, warnings if surplus > 0 else ())
+
+
+def _salvaged(name: str, tiff: tifffile.TiffFile, chain: Chain) -> _Layout:
+    """Take the leading frames that are whole."""
+    page = tiff.pages.first
+    _check_page(name, page)
+    sizes = [size for size in _declared_sizes(tiff, page) if size > 1]
+    if len(sizes) > 1:
+        axes = " x ".join(map(str, sizes))
+        raise InputError(f"{name}: truncated, and no part of a stack with several axes ({axes}) can be read")
+    declared = sizes[0] if sizes else 1
+    path = Path(tiff.filehandle.path)
+    alike = list(itertools.takewhile(lambda other: other.layout == chain.pages[0].layout, chain.pages))
+    if page.is_final and len(alike) == 1 and declared > 1:
+        planes = _adjacent_planes(path, page.dataoffsets[0], page.nbytes, declared, chain.size)
+    else:
+        planes = [Segments(path, other.offsets, other.counts) for other in alike]
+    whole = f"{declared} frames" if declared > 1 else "an unknown number of frames"
+    warning = f"it is truncated or damaged: {len(planes)} of {whole} can be read"
+    return _Layout(page, "T", (len(planes),), planes, (warning,))
+
+
+def _check_page(name: str, page: tifffile.TiffPage) -> None:
+    """Refuse what couldn't be held in memory or decoded, before anything tries."""
+    if page.dtype is None or page.compression not in list(tifffile.COMPRESSION):
+        raise InputError(
+            f"{name}: pixels of {page.bitspersample} bits with compression {page.compression} can't be read; "
+            "save it again without compression"
+        )
+    check_frame_bytes(name, page.nbytes)
+    check_frame_bytes(name, math.prod(page.chunks) * page.dtype.itemsize)
+
+
+def _check_alike(name: str, first: Page, others: Iterable[Page]) -> None:
+    for other in others:
+        if other.layout != first.layout:
+            raise InputError(
+                f"{name}: the page at byte {other.offset} has another size, type or storage than the first; "
+                "save all pages alike"
+            )
+
+
+def _plane_axes(name: str, series: tifffile.TiffPageSeries) -> tuple[str, tuple[int, ...]]:
+    """Letters and lengths of the axes that count planes."""
+    axes, shape, page = series.get_axes(False), series.get_shape(False), series.keyframe
+    inner = axes.find("Y")
+    if page.shaped[0] > 1:  # one plane for each colour
+        inner -= 1
+    if inner < 0 or math.prod(shape[inner:]) != page.size:
+        raise InputError(f"{name}: its axes {axes} don't fit its pages; save it as a plain stack")
+    return axes[:inner], tuple(shape[:inner])
+
+
+def _adjacent_planes(path: Path, start: int, length: int, count: int, size: int) -> list[Segments]:
+    """Planes without gaps between them, as many of `count` as the file of `size` bytes has."""
+    present = min(count, (size - start) // length)
+    return [Segments(path, np.array([start + k * length]), np.array([length])) for k in range(present)]
+
+
+def _listed_planes(name: str, series: tifffile.TiffPageSeries, chains: _Chains) -> list[Segments]:
+    """Planes with a page directory each, which may be in several files."""
+    planes = []
+    first = None
+    for page in series:
+        if page is None:
+            continue
+        path = Path(page.parent.filehandle.path)
+        if page.offset <= 0 or series.kind == "lsm":  # in no directory, or one that tifffile has mended
+            offsets, counts = np.array(page.dataoffsets, np.int64), np.array(page.databytecounts, np.int64)
+            planes.append(Segments(path, offsets, counts))
+            continue
+        found = chains.page(path, page.offset)
+        first = first or found
+        _check_alike(name, first, [found])
+        planes.append(Segments(path, found.offsets, found.counts))
+    return planes
+
+
+def _declared_images(tiff: tifffile.TiffFile, page: tifffile.TiffPage) -> int:
+    """Number of planes in an ImageJ description, 0 where there is none; others are part of the shape."""
+    metadata = tiff.imagej_metadata
+    if not metadata or page.samplesperpixel > 1:  # some programs count colours
+        return 0
+    images = metadata.get("images", 0)
+    return images if isinstance(images, int) else 0
+
+
+def _declared_sizes(tiff: tifffile.TiffFile, page: tifffile.TiffPage) -> list[int]:
+    """Lengths of the axes that a description declares."""
+    if tiff.ome_metadata:
+        return ome_sizes(tiff.ome_metadata)
+    if metadata := tiff.imagej_metadata:
+        sizes = [metadata.get(key, 1) for key in ("frames", "slices", "channels")]
+        return sizes if max(sizes) > 1 else [metadata.get("images", 1)]
+    if tiff.shaped_metadata:
+        return [math.prod(tiff.shaped_metadata[0]["shape"]) // page.size]
+    return []
+
+
+def _info(
+    name: str, tiff: tifffile.TiffFile, page: tifffile.TiffPage, warnings: tuple[str, ...]
+) -> StackInfo:
+    calibration = Calibration()
+    kind = ""
+    if tiff.ome_metadata:
+        kind, calibration = "OME-", ome_calibration(tiff.ome_metadata)
+    elif metadata := tiff.imagej_metadata:
+        resolution = (_ratio(page, "XResolution"), _ratio(page, "YResolution"))
+        kind = "ImageJ "
+        calibration = imagej_calibration(metadata, resolution, int(page.resolutionunit))
+    codec = "" if page.compression == 1 else f", {tifffile.COMPRESSION(page.compression).name}"
+    lossy = page.compression in _LOSSY
+    if lossy or page.compression in _PERHAPS_LOSSY:
+        verb = "has" if lossy else "may have"
+        warnings = (*warnings, f"its compression {verb} changed the pixel values")
+    if page.photometric == tifffile.PHOTOMETRIC.MINISWHITE:
+        warnings = (*warnings, "its values are marked as 0 = white, and are read as they are")
+    if page.photometric == tifffile.PHOTOMETRIC.PALETTE:
+        warnings = (*warnings, "its colour table is ignored: the values are read as they are")
+    bits = page.bitspersample if isinstance(page.bitspersample, int) else None
+    return StackInfo(
+        source=name,
+        format=f"{kind}{'BigTIFF' if tiff.is_bigtiff else 'TIFF'}{codec}",
+        frame_interval=calibration.frame_interval,
+        pixel_size=calibration.pixel_size,
+        pixel_unit=calibration.pixel_unit,
+        bits=calibration.bits or bits,
+        lossy=lossy,
+        warnings=(*warnings, *calibration.warnings),
+    )
+
+
+def _ratio(page: tifffile.TiffPage, tag: str) -> float:
+    value = page.tags.valueof(tag, default=(0, 1))
+    return value[0] / value[1] if isinstance(value, tuple) and len(value) == 2 and value[1] else 0.0

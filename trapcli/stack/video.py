@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,18 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 import cv2
 
 from trapcli.atomic import atomic_path
-from trapcli.errors import ConfigError, OutputError
+from trapcli.config import InputConfig
+from trapcli.errors import ConfigError, InputError, OutputError
 from trapcli.stack import avi
-from trapcli.stack.frames import single_frames
+from trapcli.stack.container import video_fault
+from trapcli.stack.frames import StackInfo, single_frames
+from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, guard
 
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+_GREY = {b"Y800": np.uint8, b"Y1\0\x10": np.uint16}
+_COLOUR = (b"BGR\x18", b"RGB\x18", b"GBR\0")
+_LOSSLESS = (b"\0\0\0\0", b"DIB ", b"Y800", b"GREY", b"Y8  ", b"FFV1", b"HFYU", b"FFVH", b"MPNG", b"PNG1")
 
 Codec = Literal["raw", "ffv1", "mjpeg"]
 
@@ -108,3 +116,124 @@ def _write_ffv1(path: Path, frames: Iterator[NDArray[Any]], shape: tuple[int, in
             writer.write(frame)
     finally:
         writer.release()
+
+
+def open_video(path: Path, name: str, config: InputConfig) -> Source:
+    """Open an AVI, MP4, MOV or MKV video.
+
+    Parameters
+    ----------
+    name:
+        What messages call the input.
+    config:
+        Its `allow_partial` is used here.
+
+    Raises
+    ------
+    InputError
+        Where the file is truncated, or OpenCV can't read its codec.
+    """
+    with guard(name):
+        with path.open("rb") as file:
+            fault, container = video_fault(file), _container(file)
+        if fault and not config.allow_partial:
+            raise InputError(f"{name}: truncated: {fault}; {PARTIAL_HINT}")
+        with _capture(path, name) as video:
+            codec, stored = _tag(video, cv2.CAP_PROP_FOURCC), _tag(video, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+            fps = video.get(cv2.CAP_PROP_FPS)
+            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
+            check_frame_bytes(name, size[0] * size[1] * 3)
+            count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+            warnings = _warnings(codec, stored, fps, config)
+            if config.allow_partial or container == "MKV":  # which declares no number of frames
+                present = _count(video)
+                if fault or (container != "MKV" and present != count):
+                    warnings = (f"it is truncated or damaged: {present} frames can be read", *warnings)
+                count = present
+    grey = stored in _GREY
+    dtype = np.dtype(_GREY.get(stored, np.uint8))
+
+    def read(index: NDArray[np.int64], channel: int | None) -> Iterator[NDArray[Any]]:
+        with _capture(path, name) as video:
+            position = -1
+            for wanted in index:
+                while position < wanted:
+                    if not video.grab():
+                        raise InputError(
+                            f"{name}: truncated or damaged: it declares {count} frames, "
+                            f"and frame {position + 1} can't be read; {PARTIAL_HINT}"
+                        )
+                    position += 1
+                _, frame = video.retrieve()
+                if frame is None or frame.shape[:2] != size or frame.dtype != dtype:
+                    raise InputError(f"{name}: frame {wanted} differs in size or type from the first")
+                colours = frame[..., ::-1] if not grey else frame
+                yield colours if channel is None else colours[..., channel]
+
+    info = StackInfo(
+        source=name,
+        format=f"{container}, {codec.decode('ascii', 'replace') if codec.strip(bytes(1)) else 'raw'}",
+        frame_interval=1 / fps if 0 < fps < 1e9 else None,
+        bits=8 * dtype.itemsize,
+        lossy=not _is_lossless(codec, stored),
+        warnings=warnings,
+    )
+    return Source(name, (count, *size), dtype, 1 if grey else 3, info, read)
+
+
+@contextmanager
+def _capture(path: Path, name: str) -> Iterator[cv2.VideoCapture]:
+    # the absolute path: a name such as ``a:b`` would be taken for a network protocol
+    video = cv2.VideoCapture(os.path.abspath(path), cv2.CAP_FFMPEG)
+    try:
+        if not video.isOpened():
+            raise InputError(
+                f"{name}: damaged, or of a codec that OpenCV can't read; save it as TIFF or FFV1 AVI"
+            )
+        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        if _tag(video, cv2.CAP_PROP_CODEC_PIXEL_FORMAT) in _GREY:
+            # else 16 bits become 8; but for colours, OpenCV then reads beyond its buffer
+            video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        yield video
+    finally:
+        video.release()
+
+
+def _tag(video: cv2.VideoCapture, what: int) -> bytes:
+    """Four characters of a property, such as the codec."""
+    value = video.get(what)
+    return int(value).to_bytes(4, "little") if 0 <= value < 1 << 32 else b"????"
+
+
+def _count(video: cv2.VideoCapture) -> int:
+    count = 0
+    while video.grab():
+        count += 1
+    return count
+
+
+def _is_lossless(codec: bytes, stored: bytes) -> bool:
+    # conversion between brightness with colour differences and RGB rounds
+    return codec.upper() in _LOSSLESS and (stored in _GREY or stored in _COLOUR)
+
+
+def _warnings(codec: bytes, stored: bytes, fps: float, config: InputConfig) -> tuple[str, ...]:
+    warnings = []
+    if not _is_lossless(codec, stored):
+        warnings.append(
+            "its codec has changed the pixel values: weak attenuation may be lost; prefer TIFF or FFV1"
+        )
+    if stored[:2] == b"Y1" and stored not in _GREY:
+        warnings.append(f"OpenCV reduces its {stored[3]} bits per pixel to 8; convert it to TIFF")
+    if config.frame_interval is None:
+        warnings.append(
+            f"its frame interval is that of playing it ({fps:g} frames/s); "
+            "pass --frame-interval or --fps where the camera's was another"
+        )
+    return tuple(warnings)
+
+
+def _container(file: BinaryIO) -> str:
+    file.seek(0)
+    start = file.read(8)
+    return "AVI" if start.startswith(b"RIFF") else "MKV" if start.startswith(b"\x1a\x45") else "MP4"
