@@ -1,0 +1,261 @@
+"""Centres C₂ of the frames (``eq:c2``), exact on clean frames and weighted around the object on noisy ones.
+
+One rule serves both: the centroid is taken inside a smooth disc about itself, as wide as the object stands out of the
+noise. Without noise that is the whole frame and the plain centroid; with noise the disc keeps out what is not object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from trapcli.motion.time_derivatives import choose_filters
+from trapcli.stack.frames import Frames
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+
+TAPER = 1.2
+"""Radius at which the weight has fallen to 0, in radii of the object."""
+
+_SURVEY = 32  # frames that the noise and the radius are measured on
+_RING = 2.0  # width of the rings of the radial profile [pixels]
+_VISIBLE = 0.06  # least power of a ring that counts as object, in units of the noise's
+_SIGNIFICANT = 5.0  # standard deviations
+_BLANK = 0.02  # share of the median mass below which a frame holds no object
+_CLIPPED = 0.01  # mean attenuation on one side of the frame, as a share of the frame's highest
+_CONVERGED = 1e-9  # [pixels]
+_MOST_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Centers:
+    """Centres of N frames and what was learned on the way.
+
+    Attributes
+    ----------
+    center, errors:
+        ``(N, 2)`` C₂ as (x1, x2) from pixel ``(H//2, W//2)`` and its 1-σ error from pixel noise [length]; NaN in
+        blank frames. Smoothed in time where the noise, not the motion, makes it rough.
+    mass:
+        ``(N,)`` integral of the attenuation over the frame; 0 in blank frames.
+    noise:
+        Standard deviation of the noise of one pixel [attenuation].
+    radius:
+        Distance from the centre up to which attenuation stands out of the noise [length].
+    clipped:
+        ``(N,)`` frames whose object touches the edge of the field of view.
+    """
+
+    center: Array
+    errors: Array
+    mass: Array
+    noise: float
+    radius: float
+    clipped: NDArray[np.bool_]
+
+
+def estimate_centers(
+    attenuation: Frames, *, pixel_size: float = 1.0, progress: Progress | None = None
+) -> Centers:
+    """Find the centre of every frame (``eq:c2``; Elbau et al. 2020, Inverse Problems 36).
+
+    Parameters
+    ----------
+    attenuation:
+        N attenuation projections.
+    pixel_size:
+        Edge of a pixel [length].
+    progress:
+        Called as ``progress("centers", done, N)``.
+    """
+    survey = sample_frames(attenuation)
+    noise = pixel_noise(survey)
+    radius = object_radius(survey, noise)
+    n = len(attenuation)
+    center, mass, clipped = np.full((n, 2), np.nan), np.zeros(n), np.zeros(n, bool)
+    done = 0
+    previous: Array | None = None
+    for block in attenuation.blocks():
+        for image in block:
+            found = _center(image, noise, radius, previous)
+            if found is not None:
+                previous, mass[done] = found
+                center[done] = previous
+                clipped[done] = _touches_edge(image, noise)
+            done += 1
+        if progress is not None:
+            progress("centers", done, n)
+    if (mass > 0).any():
+        faint = mass < _BLANK * np.median(mass[mass > 0])
+        center[faint], mass[faint] = np.nan, 0.0
+    center, errors = _smooth(center, mass, noise * _lever(attenuation.shape[1:], radius))
+    return Centers(
+        center * pixel_size, errors * pixel_size, mass * pixel_size**2, noise, radius * pixel_size, clipped
+    )
+
+
+def _smooth(center: Array, mass: Array, moment_noise: float) -> tuple[Array, Array]:
+    """Smooth the centres in time as far as their known noise allows; return them and their errors."""
+    errors = np.full(center.shape, np.nan)
+    seen = mass > 0
+    if seen.any():
+        noise = moment_noise / float(np.median(mass[seen]))
+        (smoother,) = choose_filters(center, (0,), noise=noise)
+        smooth = smoother.apply(center, 1.0)
+        judged = np.isfinite(smooth).all(axis=1) & seen
+        errors[seen] = noise
+        errors[judged] = noise * smoother.gains(len(center))[judged, None]
+        center = np.where(judged[:, None], smooth, center)
+    return center, errors
+
+
+def sample_frames(frames: Frames, count: int = _SURVEY) -> NDArray[np.floating[Any]]:
+    """Return at most `count` frames spread evenly over the stack, ``(K, H, W)``; frames with NaN are left out."""
+    wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+    kept: list[NDArray[Any]] = []
+    done = 0
+    for block in frames.blocks():
+        inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
+        kept.extend(np.array(block[i]) for i in inside)
+        done += len(block)
+    return np.array([image for image in kept if np.isfinite(image).all()]).reshape(-1, *frames.shape[1:])
+
+
+def pixel_noise(images: NDArray[np.floating[Any]]) -> float:
+    """Return the standard deviation of white noise in ``(K, H, W)`` images.
+
+    It is read off the corners of their Fourier transforms, beyond the circle that any smooth object keeps inside.
+    """
+    if not len(images) or min(images.shape[1:]) < 4:
+        return 0.0
+    k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
+    k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
+    corner = np.minimum(k1, k2) > 0.7
+    window = np.hanning(images.shape[1])[:, None] * np.hanning(images.shape[2])
+    powers = [
+        np.median(np.abs(np.fft.rfft2(image * window))[corner] ** 2) / np.log(2) / np.sum(window**2)
+        for image in images.astype(float)
+    ]
+    return float(np.sqrt(np.median(powers)))
+
+
+def object_radius(images: NDArray[np.floating[Any]], noise: float) -> float:
+    """Return the distance from the centre up to which the object stands out of the noise [pixels].
+
+    Parameters
+    ----------
+    images:
+        ``(K, H, W)`` attenuation.
+    noise:
+        Standard deviation of the noise of one pixel.
+    """
+    radius = farthest = float(np.hypot(*images.shape[1:]))
+    for _ in range(3):
+        profiles = np.array([_radial_profile(image, noise, radius) for image in images])
+        pixels, power = profiles.sum(axis=0) if len(profiles) else np.zeros((2, 1))
+        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1)))
+        seen = np.flatnonzero(power > least * noise**2 * pixels)
+        if not len(seen):
+            return farthest
+        radius = min(_RING * (seen[-1] + 1.0), farthest)
+    return radius
+
+
+def _radial_profile(image: NDArray[np.floating[Any]], noise: float, radius: float) -> Array:
+    """Return the pixels and their power beyond the noise in rings about the centre, ``(2, K)``."""
+    rings = int(np.hypot(*image.shape) / _RING) + 1
+    found = _center(image, noise, radius, None)
+    if found is None:
+        return np.zeros((2, rings))
+    x1, x2 = _axes(image.shape)
+    ring = (np.hypot(x1 - found[0][0], (x2 - found[0][1])[:, None]) / _RING).astype(int).ravel()
+    power = (image.astype(float) ** 2 - noise**2).ravel()
+    return np.stack([np.bincount(ring, minlength=rings)[:rings], np.bincount(ring, power, rings)[:rings]])
+
+
+def _center(
+    image: NDArray[np.floating[Any]], noise: float, radius: float, start: Array | None
+) -> tuple[Array, float] | None:
+    """Return the centre of one frame [pixels] and its mass; None where nothing stands out of the noise."""
+    if not np.isfinite(image).all():
+        return None
+    center = _brightest(image) if start is None else start
+    for _ in range(_MOST_STEPS):
+        weights, rows, columns = disc(image.shape, center, radius)
+        weighted = image[rows, columns] * weights
+        mass = float(weighted.sum(dtype=float))
+        if not mass > _SIGNIFICANT * noise * np.linalg.norm(weights):
+            return None if start is None else _center(image, noise, radius, None)
+        x1, x2 = _axes(image.shape)
+        old = center
+        center = np.array(
+            [
+                weighted.sum(axis=0, dtype=float) @ x1[columns] / mass,
+                weighted.sum(axis=1, dtype=float) @ x2[rows] / mass,
+            ]
+        )
+        if np.abs(center - old).max() < _CONVERGED:
+            break
+    return center, mass
+
+
+def disc(
+    shape: tuple[int, ...], center: Array, radius: float, taper: float = TAPER
+) -> tuple[Array, slice, slice]:
+    """Return a smooth disc, 1 inside `radius` and 0 beyond `taper` radii, and the rows and columns it covers.
+
+    Parameters
+    ----------
+    shape:
+        ``(H, W)`` of the frame.
+    center, radius:
+        In pixels, from pixel ``(H//2, W//2)``.
+    """
+    x1, x2 = _axes(shape)
+    reach = taper * radius
+    rows = _inside(np.abs(x2 - center[1]) <= reach)
+    columns = _inside(np.abs(x1 - center[0]) <= reach)
+    r2 = (x2[rows, None] - center[1]) ** 2 + (x1[columns] - center[0]) ** 2
+    if r2.size and r2.max() <= radius**2:
+        return np.ones_like(r2), rows, columns
+    ramp = np.clip((reach**2 - r2) / (reach**2 - radius**2), 0.0, 1.0)
+    return ramp**2 * (3 - 2 * ramp), rows, columns
+
+
+def _inside(mask: NDArray[np.bool_]) -> slice:
+    found = np.flatnonzero(mask)
+    return slice(found[0], found[-1] + 1) if len(found) else slice(0, 0)
+
+
+def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the coordinates of columns and rows in pixels from pixel ``(H//2, W//2)``."""
+    height, width = shape
+    return np.arange(width) - float(width // 2), np.arange(height) - float(height // 2)
+
+
+def _brightest(image: NDArray[np.floating[Any]]) -> Array:
+    """Return roughly where the object is: the middle of what is bright after strong smoothing."""
+    size = max(3, min(image.shape) // 16)
+    smooth = cv2.blur(image, (size, size))
+    x1, x2 = _axes(image.shape)
+    bright = smooth > 0.5 * smooth.max()
+    return np.array([bright.sum(axis=0) @ x1, bright.sum(axis=1) @ x2]) / max(bright.sum(), 1)
+
+
+def _lever(shape: tuple[int, ...], radius: float) -> float:
+    """Return the error of the first moment for unit pixel noise: the root of the sum of squared distances."""
+    weights, rows, columns = disc(shape, np.zeros(2), radius)
+    x1 = _axes(shape)[0][columns]
+    return float(np.sqrt(np.sum((weights * x1) ** 2)))
+
+
+def _touches_edge(image: NDArray[np.floating[Any]], noise: float) -> bool:
+    """Tell whether attenuation on the frame's border stands out of the noise and is not a mere tail."""
+    limit = max(_CLIPPED * float(image.max()), 2 * _SIGNIFICANT * noise / np.sqrt(max(image.shape)))
+    return any(float(side.mean()) > limit for side in (image[0], image[-1], image[:, 0], image[:, -1]))

@@ -1,0 +1,251 @@
+"""The reduced attenuation map J̃ (``eqRecMapReduced``): each frame's Fourier transform about its centre, on lines.
+
+Everything after this needs J̃ on lines through the origin only, so it is sampled once on a polar grid and the frames are
+not needed again. What is sampled follows from the data: the frames are cropped to the object, the band ends where the
+spectrum meets the noise, and pixels finer than the band needs are binned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import finufft
+import numpy as np
+from numpy.typing import NDArray
+
+from trapcli.errors import InputError
+from trapcli.motion.centers import TAPER, Centers, Progress, disc, sample_frames
+from trapcli.motion.time_derivatives import difference_noise
+from trapcli.motion.types import ReducedMap
+from trapcli.stack.frames import Frames
+
+Array = NDArray[np.float64]
+
+MARGIN = 1.1
+"""Radius that the sampling resolves, in radii of the object."""
+
+FINEST = 100.0
+"""Highest band times radius that is sampled: about the number of resolved cells across the object."""
+
+_SURVEY = 12  # frames on which the grid is laid out
+_SPECTRUM_END = (
+    1e-6  # amplitude, as a share of the highest, below which even a clean spectrum carries nothing
+)
+_ABOVE_NOISE = 0.05  # power beyond the noise's that still counts once many frames are averaged
+_SINGLE_PRECISION = (
+    1e-5  # noise, as a share of the highest sample, that leaves nothing for double precision to keep
+)
+_BATCH = 32  # frames per transform
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """How frames become polar samples: crop and bin [pixels], mask radius [pixels], polar grid and precision."""
+
+    crop: tuple[int, int]
+    binning: int
+    radius: float
+    pixel_size: float
+    mu: Array
+    phi: Array
+    single: bool
+
+
+def reduce_frames(
+    attenuation: Frames,
+    centers: Centers,
+    *,
+    time: Array,
+    pixel_size: float = 1.0,
+    band: float = 0.0,
+    progress: Progress | None = None,
+) -> ReducedMap:
+    """Sample the reduced attenuation map of all frames (``eqRecMapReduced``; Elbau et al. 2020, Inverse Problems 36).
+
+    Parameters
+    ----------
+    attenuation:
+        N attenuation projections.
+    centers:
+        Their centres, from `trapcli.motion.centers.estimate_centers` with the same pixel size.
+    time:
+        ``(N,)`` times.
+    pixel_size:
+        Edge of a pixel [length].
+    band:
+        Highest spatial frequency [rad / length]; 0 finds where the spectrum meets the noise.
+    progress:
+        Called as ``progress("reduced map", done, N)``.
+
+    Returns
+    -------
+    ReducedMap
+        Blank frames hold NaN.
+
+    Raises
+    ------
+    InputError
+        Where no frame holds an object.
+    """
+    if not np.isfinite(centers.center).any():
+        raise InputError(f"{attenuation.info.source}: no frame shows an object; check the background")
+    grid = _lay_out(attenuation, centers, pixel_size, band)
+    transform = _PolarTransform(grid)
+    samples = np.full((len(attenuation), len(grid.mu), len(grid.phi)), np.nan, transform.dtype)
+    done = 0
+    for block in attenuation.blocks():
+        for first in range(0, len(block), _BATCH):
+            images = block[first : first + _BATCH]
+            place = slice(done, done + len(images))
+            seen = np.isfinite(centers.center[place, 0])
+            if seen.any():
+                samples[place][seen] = transform(images[seen], centers.center[place][seen])
+            done += len(images)
+            if progress is not None:
+                progress("reduced map", done, len(attenuation))
+    noise = transform.noise_gain * centers.noise
+    measured = difference_noise(samples.reshape(len(samples), -1)[:, :: max(1, samples[0].size // 400)])
+    return ReducedMap(
+        samples, grid.mu, grid.phi, time, min(noise, measured) if len(samples) > 8 else noise, centers.radius
+    )
+
+
+class _PolarTransform:
+    """Fourier transforms of batches of frames at the nodes of a polar grid, about their centres."""
+
+    def __init__(self, grid: _Grid) -> None:
+        self.grid = grid
+        self.dtype = np.dtype(np.complex64 if grid.single else np.complex128)
+        self._cells = tuple(-(-size // grid.binning) for size in grid.crop)
+        cell = grid.binning * grid.pixel_size
+        self._k1 = np.multiply.outer(grid.mu, np.cos(grid.phi))
+        self._k2 = np.multiply.outer(grid.mu, np.sin(grid.phi))
+        # what averaging over a cell has taken from each frequency, and the measure of the integral
+        self._factor = cell**2 / (2 * np.pi) / (_cell_mean(self._k1, grid) * _cell_mean(self._k2, grid))
+        self._points = [
+            (k * cell).ravel().astype(self.dtype.type(0).real.dtype) for k in (self._k2, self._k1)
+        ]
+        self._plans: dict[int, Any] = {}
+
+    @property
+    def noise_gain(self) -> float:
+        """Standard deviation of a sample's noise for white pixel noise of unit standard deviation."""
+        weights = disc(self.grid.crop, np.zeros(2), self.grid.radius)[0]
+        return float(np.linalg.norm(weights)) * self.grid.pixel_size**2 / (2 * np.pi)
+
+    def __call__(self, images: NDArray[Any], centers: Array) -> NDArray[Any]:
+        """Return the ``(n, M, L)`` samples of ``(n, H, W)`` frames with ``(n, 2)`` centres [length]."""
+        grid, (rows, columns) = self.grid, self._cells
+        b = grid.binning
+        cropped = np.zeros((len(images), rows * b, columns * b))
+        middle = np.empty((len(images), 2))
+        for n, (image, center) in enumerate(zip(images, centers / grid.pixel_size, strict=True)):
+            middle[n] = _cut(image, center, grid, cropped[n])
+        cells = cropped.reshape(len(images), rows, b, columns, b).mean(axis=(2, 4)) if b > 1 else cropped
+        values = self._plan(len(images)).execute(np.ascontiguousarray(cells, dtype=self.dtype))
+        shift = centers - middle * grid.pixel_size
+        phase = np.exp(1j * (shift[:, 0, None, None] * self._k1 + shift[:, 1, None, None] * self._k2))
+        polar: NDArray[Any] = values.reshape(len(images), *self._k1.shape) * (phase * self._factor)
+        return polar
+
+    def _plan(self, batch: int) -> Any:
+        if batch not in self._plans:
+            plan = finufft.Plan(
+                2,
+                self._cells,
+                batch,
+                eps=1e-6 if self.grid.single else 1e-14,
+                isign=-1,
+                dtype=self.dtype.name,
+            )
+            plan.setpts(*self._points)
+            self._plans[batch] = plan
+        return self._plans[batch]
+
+
+def _cell_mean(k: Array, grid: _Grid) -> Array:
+    """Return the mean over one binned cell of exp(−ikx) about the cell's middle."""
+    b = grid.binning
+    offsets = (np.arange(b) - (b - 1) / 2) * grid.pixel_size
+    return np.asarray(np.mean(np.cos(np.multiply.outer(k, offsets)), axis=-1))
+
+
+def _cut(image: NDArray[Any], center: Array, grid: _Grid, target: Array) -> Array:
+    """Copy the weighted surroundings of the object into `target`; return where its middle cell lies [pixels]."""
+    height, width = image.shape
+    origin = np.array([width // 2, height // 2])
+    size = np.array([grid.crop[1], grid.crop[0]])
+    corner = np.clip(np.round(center).astype(int) + origin - size // 2, 0, [width, height] - size)
+    (left, top), (columns, rows) = corner, size
+    inside = image[top : top + rows, left : left + columns]
+    # `disc` counts from the middle pixel of what it is given
+    weights, row_slice, column_slice = disc(inside.shape, center + origin - corner - size // 2, grid.radius)
+    target[row_slice, column_slice] = inside[row_slice, column_slice] * weights
+    b = grid.binning
+    cells = np.array([target.shape[1] // b // 2, target.shape[0] // b // 2])
+    return np.asarray(corner + cells * b + (b - 1) / 2 - origin)
+
+
+def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: float) -> _Grid:
+    """Choose crop, band, binning, polar grid and precision from a few frames."""
+    height, width = attenuation.shape[1:]
+    radius = centers.radius / pixel_size
+    reach = 2 * int(np.ceil(TAPER * radius) + 1)
+    crop = min(reach, height), min(reach, width)
+    wanted = np.flatnonzero(np.isfinite(centers.center[:, 0]))
+    chosen = wanted[np.unique(np.linspace(0, len(wanted) - 1, _SURVEY).round().astype(int))]
+    images = _pick(attenuation, chosen)
+    finest = min(0.9 * np.pi / pixel_size, FINEST / centers.radius)
+    whole = _Grid(
+        crop, 1, radius, pixel_size, _rings(finest, centers.radius), _angles(int(FINEST * 1.6)), False
+    )
+    transform = _PolarTransform(whole)
+    survey = transform(images, centers.center[chosen])
+    noise = transform.noise_gain * centers.noise
+    if band <= 0:
+        band = _band(survey, whole.mu, noise)
+    mu = _rings(min(band, 0.9 * np.pi / pixel_size), centers.radius)
+    highest = float(np.abs(survey).max())
+    lines = _lines(survey[:, whole.mu <= mu[-1]], max(0.01 * noise, 1e-15 * highest))
+    binning = max(1, int(np.pi / pixel_size / (2 * mu[-1])))
+    return _Grid(crop, binning, radius, pixel_size, mu, _angles(lines), noise > _SINGLE_PRECISION * highest)
+
+
+def _pick(attenuation: Frames, chosen: NDArray[np.int64]) -> NDArray[Any]:
+    kept = []
+    done = 0
+    for block in attenuation.blocks():
+        inside = chosen[(chosen >= done) & (chosen < done + len(block))] - done
+        kept.extend(np.array(block[i]) for i in inside)
+        done += len(block)
+    return np.array(kept)
+
+
+def _rings(band: float, radius: float) -> Array:
+    """Return radii spaced so that an object of `radius` is just resolved along a line."""
+    step = np.pi / (MARGIN * radius)
+    return step * np.arange(1, max(4, int(np.ceil(band / step))) + 1)
+
+
+def _angles(count: int) -> Array:
+    return np.arange(count) * np.pi / count
+
+
+def _band(survey: NDArray[Any], mu: Array, noise: float) -> float:
+    """Return the highest ring whose power stands out of the noise."""
+    power = np.mean(np.abs(survey) ** 2, axis=(0, 2))
+    independent = len(survey) * np.maximum(2 * np.arange(1, len(mu) + 1), 4)
+    least = noise**2 * (1 + np.maximum(_ABOVE_NOISE, 4 / np.sqrt(independent)))
+    seen = np.flatnonzero(power > np.maximum(least, _SPECTRUM_END**2 * power.max()))
+    return float(mu[seen[-1]]) if len(seen) else float(mu[0])
+
+
+def _lines(survey: NDArray[Any], negligible: float) -> int:
+    """Return how many angles in [0, π) resolve the rings down to `negligible`."""
+    turn = np.concatenate([survey, np.conj(survey)], axis=-1)
+    spectrum = np.abs(np.fft.fft(turn, axis=-1)).max(axis=(0, 1)) / turn.shape[-1]
+    size = survey.shape[-1]
+    amplitude = np.maximum(spectrum[1:size], spectrum[:-size:-1])
+    needed = np.flatnonzero(amplitude > negligible)
+    return max(16, 2 * ((needed[-1] + 6) // 2)) if len(needed) else 16
