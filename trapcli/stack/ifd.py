@@ -43,7 +43,7 @@ _LAYOUT = (256, 257, 258, 259, 262, 266, 277, 278, 284, 317, 322, 323, 338, 339,
 _NEEDED = frozenset((*_OFFSETS, *_COUNTS, *_LAYOUT, _DESCRIPTION))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Page:
     """One page directory.
 
@@ -100,6 +100,7 @@ class _Reader:
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file = file
         self._size = size
+        self._layouts: dict[tuple[tuple[int, bytes], ...], tuple[tuple[int, bytes], ...]] = {}
         header = self._read(0, 8)
         self._order = "<" if header[:2] == b"II" else ">"
         self._big = self._unpack("H", header[2:4]) == 43
@@ -145,7 +146,9 @@ class _Reader:
             elif code != _DESCRIPTION:
                 layout.append((code, data))
         self._check_segments(offsets, counts)
-        return Page(offset, tuple(layout), offsets, counts), following
+        # pages share one tuple: there may be a million of them
+        shared = self._layouts.setdefault(tuple(layout), tuple(layout))
+        return Page(offset, shared, offsets, counts), following
 
     def _check_segments(self, offsets: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
         if len(counts) and len(counts) != len(offsets):

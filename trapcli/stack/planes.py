@@ -20,7 +20,7 @@ _ALPHA = (1, 2)
 ReadPlane = Callable[[int], NDArray[Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Segments:
     """Where the pixels of one plane are: the strips or tiles in a file [bytes]."""
 

@@ -21,6 +21,12 @@ from trapcli.stack.frames import Frames, StackInfo
 MAX_FRAME_BYTES = 1 << 30
 """Largest frame that is read: a file of some kilobytes can declare one of terabytes."""
 
+MAX_FRAMES = 4_000_000
+"""Most frames of an input: a file of some kilobytes can declare billions."""
+
+# ITU-R BT.601, with which codecs separate brightness from colour: errors of the latter cancel
+_LUMA = np.array([0.299, 0.587, 0.114])
+
 PARTIAL_HINT = "copy or save it again, or use what can be read of it with --allow-partial"
 
 
@@ -42,6 +48,8 @@ class Source:
         ``read(index, channel)`` yields the frames at the ascending positions `index`: ``(H, W)`` of one
         channel, or ``(H, W, channels)`` where `channel` is None and there are several. The next frame may
         overwrite it.
+    colour_tolerance:
+        Colours that differ by no more than this many counts are grey: lossy codecs store grey with errors.
     """
 
     name: str
@@ -50,6 +58,7 @@ class Source:
     channels: int
     info: StackInfo
     read: Callable[[NDArray[np.int64], int | None], Iterator[NDArray[Any]]]
+    colour_tolerance: int = 0
 
     def __post_init__(self) -> None:
         if self.dtype.kind not in "biuf":
@@ -58,6 +67,7 @@ class Source:
             raise InputError(f"{self.name}: its frames have {self.shape[1]} x {self.shape[2]} pixels")
         if self.shape[0] < 1:
             raise InputError(f"{self.name}: has no frames")
+        check_frame_count(self.name, self.shape[0])
         frame_bytes = self.shape[1] * self.shape[2] * self.channels * self.dtype.itemsize
         check_frame_bytes(self.name, frame_bytes)
 
@@ -69,6 +79,12 @@ def check_frame_bytes(name: str, size: int) -> None:
             f"{name}: declares frames of {size / 2**30:.3g} GiB; the limit is {MAX_FRAME_BYTES >> 30} GiB; "
             "it is damaged, or no video of a particle"
         )
+
+
+def check_frame_count(name: str, count: int) -> None:
+    """Refuse a number of frames that is too large to be true."""
+    if count > MAX_FRAMES:
+        raise InputError(f"{name}: declares {count} frames; the limit is {MAX_FRAMES}, or it is damaged")
 
 
 def select(source: Source, config: InputConfig) -> Frames:
@@ -149,13 +165,19 @@ def _channel(source: Source, channel: int | None) -> int | None:
 def _grey(source: Source, frame: NDArray[Any]) -> NDArray[Any]:
     if frame.ndim == 2:
         return frame
-    first = frame[..., :1]
-    if not np.array_equal(np.broadcast_to(first, frame.shape), frame, equal_nan=frame.dtype.kind == "f"):
-        raise InputError(
-            f"{source.name}: its {source.channels} channels differ; "
-            f"choose one with --channel 0 to {source.channels - 1}"
-        )
-    return frame[..., 0]
+    first = frame[..., 0]
+    if all(
+        np.array_equal(first, frame[..., k], equal_nan=first.dtype.kind == "f")
+        for k in range(1, frame.shape[2])
+    ):
+        return first
+    if source.colour_tolerance and np.ptp(frame, axis=2).max() <= source.colour_tolerance:
+        luma: NDArray[Any] = np.rint(frame @ _LUMA).astype(frame.dtype)
+        return luma
+    raise InputError(
+        f"{source.name}: its {source.channels} channels differ; "
+        f"choose one with --channel 0 to {source.channels - 1}"
+    )
 
 
 def _overridden(info: StackInfo, config: InputConfig) -> StackInfo:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import uuid
 from collections.abc import Iterable, Iterator
@@ -29,7 +30,7 @@ from trapcli.stack.metadata import (
     ome_sizes,
 )
 from trapcli.stack.planes import PlaneReader, Segments
-from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, guard
+from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, check_frame_count, guard
 
 CLASSIC_TIFF_LIMIT = 3_900_000_000
 """Bytes of pixels above which a BigTIFF is written; offsets in a classic TIFF end at 4 GiB."""
@@ -166,8 +167,10 @@ def open_tiff(path: Path, name: str, config: InputConfig) -> Source:
     with guard(name):
         chains = _Chains(name)
         chain = chains.chain(path)
-        if not chain.pages or (chain.fault and not config.allow_partial):
+        if chain.fault and not config.allow_partial:
             raise InputError(f"{name}: truncated or damaged: {chain.fault}; {PARTIAL_HINT}")
+        if not chain.pages:
+            raise InputError(f"{name}: truncated or damaged, and no frame of it can be read: {chain.fault}")
     with guard(name, strict=not config.allow_partial) as log, tifffile.TiffFile(path) as tiff:
         layout = _whole_or_part(name, tiff, chains, config.allow_partial)
         table, doubts = frame_planes(
@@ -240,6 +243,7 @@ def _layout(name: str, tiff: tifffile.TiffFile, chains: _Chains) -> _Layout:
     _check_page(name, page)
     axes, sizes = _plane_axes(name, series)
     count = math.prod(sizes)
+    check_frame_count(name, count)
     path = Path(tiff.filehandle.path)
     chain = chains.chain(path)
     if series.dataoffset is None:
@@ -268,6 +272,7 @@ def _salvaged(name: str, tiff: tifffile.TiffFile, chain: Chain) -> _Layout:
         axes = " x ".join(map(str, sizes))
         raise InputError(f"{name}: truncated, and no part of a stack with several axes ({axes}) can be read")
     declared = sizes[0] if sizes else 1
+    check_frame_count(name, declared)
     path = Path(tiff.filehandle.path)
     alike = list(itertools.takewhile(lambda other: other.layout == chain.pages[0].layout, chain.pages))
     if page.is_final and len(alike) == 1 and declared > 1:
@@ -351,8 +356,8 @@ def _declared_sizes(tiff: tifffile.TiffFile, page: tifffile.TiffPage) -> list[in
     if metadata := tiff.imagej_metadata:
         sizes = [metadata.get(key, 1) for key in ("frames", "slices", "channels")]
         return sizes if max(sizes) > 1 else [metadata.get("images", 1)]
-    if tiff.shaped_metadata:
-        return [math.prod(tiff.shaped_metadata[0]["shape"]) // page.size]
+    if page.shaped_description:
+        return [math.prod(json.loads(page.shaped_description)["shape"]) // page.size]
     return []
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -27,7 +28,8 @@ from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, guard
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 _GREY = {b"Y800": np.uint8, b"Y1\0\x10": np.uint16}
-_COLOUR = (b"BGR\x18", b"RGB\x18", b"GBR\0")
+_COLOUR = (b"BGR\x18", b"RGB\x18", b"BGR\0", b"RGB\0", b"BGRA", b"RGBA", b"G3\0\x08")
+_LOSSY_COLOUR_TOLERANCE = 8
 _LOSSLESS = (b"\0\0\0\0", b"DIB ", b"Y800", b"GREY", b"Y8  ", b"FFV1", b"HFYU", b"FFVH", b"MPNG", b"PNG1")
 
 Codec = Literal["raw", "ffv1", "mjpeg"]
@@ -118,6 +120,24 @@ def _write_ffv1(path: Path, frames: Iterator[NDArray[Any]], shape: tuple[int, in
         writer.release()
 
 
+@dataclass(frozen=True)
+class _Header:
+    """What a video says of itself; its frames are counted where it can't be trusted with that."""
+
+    container: str
+    codec: bytes
+    stored: bytes
+    fps: float
+    count: int
+    size: tuple[int, int]
+    warnings: tuple[str, ...]
+
+    @property
+    def lossless(self) -> bool:
+        # conversion between brightness with colour differences and RGB rounds
+        return self.codec.upper() in _LOSSLESS and (self.stored in _GREY or self.stored in _COLOUR)
+
+
 def open_video(path: Path, name: str, config: InputConfig) -> Source:
     """Open an AVI, MP4, MOV or MKV video.
 
@@ -134,24 +154,10 @@ def open_video(path: Path, name: str, config: InputConfig) -> Source:
         Where the file is truncated, or OpenCV can't read its codec.
     """
     with guard(name):
-        with path.open("rb") as file:
-            fault, container = video_fault(file), _container(file)
-        if fault and not config.allow_partial:
-            raise InputError(f"{name}: truncated: {fault}; {PARTIAL_HINT}")
-        with _capture(path, name) as video:
-            codec, stored = _tag(video, cv2.CAP_PROP_FOURCC), _tag(video, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
-            fps = video.get(cv2.CAP_PROP_FPS)
-            size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
-            check_frame_bytes(name, size[0] * size[1] * 3)
-            count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-            warnings = _warnings(codec, stored, fps, config)
-            if config.allow_partial or container == "MKV":  # which declares no number of frames
-                present = _count(video)
-                if fault or (container != "MKV" and present != count):
-                    warnings = (f"it is truncated or damaged: {present} frames can be read", *warnings)
-                count = present
-    grey = stored in _GREY
-    dtype = np.dtype(_GREY.get(stored, np.uint8))
+        header = _read_header(path, name, config.allow_partial)
+    grey = header.stored in _GREY
+    dtype = np.dtype(_GREY.get(header.stored, np.uint8))
+    interval = 1 / header.fps if 0 < header.fps < 1e9 else None
 
     def read(index: NDArray[np.int64], channel: int | None) -> Iterator[NDArray[Any]]:
         with _capture(path, name) as video:
@@ -160,25 +166,61 @@ def open_video(path: Path, name: str, config: InputConfig) -> Source:
                 while position < wanted:
                     if not video.grab():
                         raise InputError(
-                            f"{name}: truncated or damaged: it declares {count} frames, "
+                            f"{name}: truncated or damaged: it declares {header.count} frames, "
                             f"and frame {position + 1} can't be read; {PARTIAL_HINT}"
                         )
                     position += 1
                 _, frame = video.retrieve()
-                if frame is None or frame.shape[:2] != size or frame.dtype != dtype:
+                if frame is None or frame.shape[:2] != header.size or frame.dtype != dtype:
                     raise InputError(f"{name}: frame {wanted} differs in size or type from the first")
-                colours = frame[..., ::-1] if not grey else frame
+                colours = frame if grey else frame[..., ::-1]
                 yield colours if channel is None else colours[..., channel]
 
+    warnings = header.warnings
+    if config.frame_interval is None and interval:
+        playing = f"its frame interval is that of playing it ({header.fps:g} frames/s)"
+        warnings = (*warnings, f"{playing}; pass --frame-interval or --fps where the camera's was another")
+    codec = header.codec.decode("ascii", "replace") if header.codec.strip(bytes(1)) else "raw"
     info = StackInfo(
         source=name,
-        format=f"{container}, {codec.decode('ascii', 'replace') if codec.strip(bytes(1)) else 'raw'}",
-        frame_interval=1 / fps if 0 < fps < 1e9 else None,
+        format=f"{header.container}, {codec}",
+        frame_interval=interval,
         bits=8 * dtype.itemsize,
-        lossy=not _is_lossless(codec, stored),
+        lossy=not header.lossless,
         warnings=warnings,
     )
-    return Source(name, (count, *size), dtype, 1 if grey else 3, info, read)
+    tolerance = 0 if header.lossless else _LOSSY_COLOUR_TOLERANCE
+    return Source(name, (header.count, *header.size), dtype, 1 if grey else 3, info, read, tolerance)
+
+
+def _read_header(path: Path, name: str, allow_partial: bool) -> _Header:
+    with path.open("rb") as file:
+        fault, container = video_fault(file), _container(file)
+    if fault and not allow_partial:
+        raise InputError(f"{name}: truncated: {fault}; {PARTIAL_HINT}")
+    with _capture(path, name) as video:
+        codec, stored = _tag(video, cv2.CAP_PROP_FOURCC), _tag(video, cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+        size = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        check_frame_bytes(name, size[0] * size[1] * 3)
+        declared = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        about = container == "MKV"  # which declares a duration only
+        count = _count(video) if allow_partial or about else declared
+        header = _Header(container, codec, stored, video.get(cv2.CAP_PROP_FPS), count, size, ())
+    warnings = []
+    if fault or count < declared - about:
+        if not allow_partial:
+            raise InputError(
+                f"{name}: damaged: {count} of about {declared} frames can be read; {PARTIAL_HINT}"
+            )
+        count -= bool(fault)  # the last one may be cut, which FFmpeg conceals
+        warnings.append(f"it is truncated or damaged: {count} frames can be read")
+    if not header.lossless:
+        warnings.append(
+            "its codec has changed the pixel values: weak attenuation may be lost; prefer TIFF or FFV1"
+        )
+    if stored[:2] == b"Y1" and stored not in _GREY:
+        warnings.append(f"OpenCV reduces its {stored[3]} bits per pixel to 8; convert it to TIFF")
+    return replace(header, count=count, warnings=tuple(warnings))
 
 
 @contextmanager
@@ -210,27 +252,6 @@ def _count(video: cv2.VideoCapture) -> int:
     while video.grab():
         count += 1
     return count
-
-
-def _is_lossless(codec: bytes, stored: bytes) -> bool:
-    # conversion between brightness with colour differences and RGB rounds
-    return codec.upper() in _LOSSLESS and (stored in _GREY or stored in _COLOUR)
-
-
-def _warnings(codec: bytes, stored: bytes, fps: float, config: InputConfig) -> tuple[str, ...]:
-    warnings = []
-    if not _is_lossless(codec, stored):
-        warnings.append(
-            "its codec has changed the pixel values: weak attenuation may be lost; prefer TIFF or FFV1"
-        )
-    if stored[:2] == b"Y1" and stored not in _GREY:
-        warnings.append(f"OpenCV reduces its {stored[3]} bits per pixel to 8; convert it to TIFF")
-    if config.frame_interval is None:
-        warnings.append(
-            f"its frame interval is that of playing it ({fps:g} frames/s); "
-            "pass --frame-interval or --fps where the camera's was another"
-        )
-    return tuple(warnings)
 
 
 def _container(file: BinaryIO) -> str:
