@@ -37,8 +37,8 @@ def command(result: Path, truth: Path, trim: int, as_json: bool, console: Consol
 
     Differences that no method can know are removed first: the mirror solution, the offset of T and the
     orientation of the object at the first frame. Frames that are not valid are left out. Where RESULT states
-    1-sigma errors, the last two columns say how many errors lie within one and two of them (68 % and 95 % where
-    they are true).
+    1-sigma errors, the last two columns say how many errors lie within one and two of them (68 % and 95 %
+    where they are true).
     """
     from trapcli.errors import InputError
     from trapcli.result.comparison import compare

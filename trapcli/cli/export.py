@@ -20,8 +20,8 @@ from trapcli.cli.options import PATH, Console, console_options, overwrite_option
 def command(result: Path, kind: str, output: Path, overwrite: bool, console: Console) -> None:
     """Write RESULT as one row per frame.
 
-    CSV opens in any spreadsheet and with pandas.read_csv; unknown values are empty cells. JSON holds the units
-    of all columns too; unknown values are null.
+    CSV opens in any spreadsheet and with pandas.read_csv; unknown values are empty cells. JSON holds the
+    units of all columns too; unknown values are null.
     """
     from trapcli.atomic import atomic_path
     from trapcli.result.motion import Motion

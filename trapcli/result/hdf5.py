@@ -6,6 +6,8 @@ The file is built in memory and written in one piece, so that a full disk is an 
 
 from __future__ import annotations
 
+import mmap
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,9 @@ _ROW_BYTES = 8 * 32
 """Memory of one frame, all series together."""
 _MAX_TEXT = 16 << 20
 _TEXT = h5py.string_dtype()
+_HEAP_SIGNATURE = b"GCOL\x01"
+_HEAP_SIZE = struct.Struct("<Q")
+_HEAP_ENTRY = struct.Struct("<H6xQ")
 _HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError, TypeError, OverflowError, MemoryError)
 """What h5py raises on files that are damaged or not what they seem."""
 
@@ -74,6 +79,7 @@ def load(path: Path) -> Motion:
     try:
         if not path.is_file():
             raise InputError(f"{path}: {'not a file' if path.exists() else 'no such file'}")
+        _check_heaps(path)
         with h5py.File(path, "r", locking=False) as file:
             return _Reader(path, file).motion()
     except PermissionError:
@@ -108,7 +114,9 @@ def rotation_angles(R: Array) -> Array:
 
 
 def _image(motion: Motion) -> bytes:
-    with h5py.File("result", "w", driver="core", backing_store=False) as file:
+    # from version 1.8 of the format on, checksums tell damaged metadata, which can crash or hang the library
+    versions = ("v108", "v108")
+    with h5py.File("result", "w", driver="core", backing_store=False, libver=versions) as file:
         file.attrs.update(NX_class="NXroot", default="motion", format=FORMAT, format_version=FORMAT_VERSION)
         entry = _group(file, "motion", "NXentry", default="angular_velocity")
         rate = f"rad/{motion.time_unit}"
@@ -197,6 +205,30 @@ def _clean(text: str) -> str:
 
 
 # reading
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse damaged global heaps (which hold the texts): the HDF5 library would loop over them for ever."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        heap, previous_end = content.find(_HEAP_SIGNATURE), 0
+        while 0 <= heap <= len(content) - 16:
+            end = heap + _HEAP_SIZE.unpack_from(content, heap + 8)[0]
+            if end <= len(content):  # the library itself refuses what goes on beyond the file
+                if heap < previous_end or not _heap_ends(content, heap + 16, end):
+                    raise ValueError("damaged texts")
+                previous_end = end
+            heap = content.find(_HEAP_SIGNATURE, heap + 16)
+
+
+def _heap_ends(content: mmap.mmap, entry: int, end: int) -> bool:
+    while entry + 16 <= end:
+        index, size = _HEAP_ENTRY.unpack_from(content, entry)
+        # the size of free space (index 0) counts its own header, that of a text doesn't
+        step = size if index == 0 else 16 + -(-size // 8) * 8
+        if step < 16:
+            return False
+        entry += step
+    return True
 
 
 class _Reader:
@@ -320,9 +352,15 @@ class _Reader:
         return unit
 
     def _attribute(self, name: str, attribute: str, default: Any) -> Any:
-        value = (self._object(name, (h5py.Group, h5py.Dataset)) if name else self.file).attrs.get(
-            attribute, default
-        )
+        attributes = (self._object(name, (h5py.Group, h5py.Dataset)) if name else self.file).attrs
+        if attribute not in attributes:
+            return default
+        stored = attributes.get_id(attribute)
+        if stored.shape != () or (
+            stored.dtype.kind not in "bui" and not h5py.check_string_dtype(stored.dtype)
+        ):
+            raise self._error(f"attribute {attribute} of /{name} is neither a number nor a text")
+        value = attributes[attribute]
         return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
     def _dataset(self, name: str) -> h5py.Dataset:
