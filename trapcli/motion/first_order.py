@@ -40,7 +40,9 @@ class FirstOrder:
     phi, omega_3:
         ``(n,)`` direction in [0, π) [rad] and height [rad / time].
     covariance:
-        ``(n, 2, 2)`` of (φ, ω₃).
+        ``(n, 2, 2)`` of (φ, ω₃), as it follows from `RingErrors`.
+    misfit:
+        ``(n,)`` χ² per degree of freedom.
     residual:
         ``(n,)`` ‖∂tJ̃ − ω₃ ∂φJ̃‖ / ‖∂tJ̃‖ on the line.
     ambiguous:
@@ -54,11 +56,14 @@ class FirstOrder:
         nothing speaks for α > 0.
     structured:
         ``(n,)`` frames in which ∂φJ̃ stands out, so that a turn about the optical axis would be seen.
+    pace:
+        ``(n,)`` ‖∂tJ̃‖ / ‖μ · radius · J̃‖, about how fast the object turns [rad / time].
     """
 
     phi: Array
     omega_3: Array
     covariance: Array
+    misfit: Array
     residual: Array
     ambiguous: NDArray[np.bool_]
     open_share: Array
@@ -66,6 +71,7 @@ class FirstOrder:
     common_error: Array
     excess: Array
     structured: NDArray[np.bool_]
+    pace: Array
 
 
 def landscape(slope: NDArray[Any], rate: NDArray[Any], epsilon: float) -> tuple[Array, Array]:
@@ -118,15 +124,16 @@ def solve(value: NDArray[Any], rate: NDArray[Any], errors: RingErrors) -> tuple[
     best = np.argmin(line.chi2, axis=1)[:, None]
     final = _refine(value, rate, errors, line.pick(best), _MANY)
     phi, omega_3, chi2 = final.phi[:, 0], final.omega_3[:, 0], final.chi2[:, 0]
-    scale = np.maximum(chi2 / max(2 * errors.share * value.shape[1] - 2, 1.0), 1.0)
+    misfit = chi2 / max(2 * errors.share * value.shape[1] - 2, 1.0)
     everything = np.einsum("m,nmk->nk", _weights(errors, np.zeros(1))[0], np.abs(rates) ** 2)
-    limit = (chi2 + _AS_GOOD * scale + _EXACT**2 * everything.max(axis=1))[:, None]
+    limit = (chi2 + _AS_GOOD * np.maximum(misfit, 1.0) + _EXACT**2 * everything.max(axis=1))[:, None]
     apart = np.abs((line.phi - phi[:, None] + np.pi / 2) % np.pi - np.pi / 2) > np.pi / size
     common, common_error, excess = _common_height(slopes, rates, errors)
     solution = FirstOrder(
         phi=phi % np.pi,
         omega_3=omega_3,
-        covariance=_inverse(final.normal[:, 0]) * scale[:, None, None],
+        covariance=_inverse(final.normal[:, 0]),
+        misfit=misfit,
         residual=_relative_residual(value, rate, phi, omega_3),
         ambiguous=(apart & (line.chi2 < limit)).any(axis=1),
         open_share=np.mean(misfits < limit, axis=1),
@@ -134,6 +141,7 @@ def solve(value: NDArray[Any], rate: NDArray[Any], errors: RingErrors) -> tuple[
         common_error=common_error,
         excess=excess,
         structured=_structured(slopes, value, errors),
+        pace=_pace(value, rate, errors),
     )
     return solution, phi_function
 
@@ -190,10 +198,15 @@ def _common_height(
 
 def _structured(slopes: NDArray[Any], value: NDArray[Any], errors: RingErrors) -> NDArray[np.bool_]:
     power = np.mean(np.abs(slopes) ** 2, axis=2)
-    noise = (errors.value * errors.gain(1)) ** 2
-    level = (errors.mu * errors.radius) ** 2 * np.mean(np.abs(value) ** 2, axis=2)
-    seen = (power > _STANDS_OUT * noise) & (power > _ROUND**2 * level.max(axis=1, keepdims=True))
-    return np.asarray(seen.any(axis=1))
+    over_noise = np.mean(power / (errors.value * errors.gain(1)) ** 2, axis=1)
+    level = np.max((errors.mu * errors.radius) ** 2 * np.mean(np.abs(value) ** 2, axis=2), axis=1)
+    return np.asarray((over_noise > _STANDS_OUT) & (power.max(axis=1) > _ROUND**2 * level))
+
+
+def _pace(value: NDArray[Any], rate: NDArray[Any], errors: RingErrors) -> Array:
+    reach = (errors.mu * errors.radius)[:, None] * value
+    pace: Array = np.linalg.norm(rate, axis=(1, 2)) / np.linalg.norm(reach, axis=(1, 2))
+    return pace
 
 
 def _minima(values: Array, count: int) -> NDArray[np.intp]:

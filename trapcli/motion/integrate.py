@@ -11,6 +11,7 @@ Array = NDArray[np.float64]
 
 # nodes of the two-point Gauss rule on [0, 1]
 _GAUSS = (0.5 - np.sqrt(3) / 6, 0.5 + np.sqrt(3) / 6)
+_BRIDGED = 0.5  # error of an interpolated ω in units of ω
 
 
 def integrate_rotation(omega: Array, time: Array, *, bridge: int = 0) -> Array:
@@ -78,14 +79,15 @@ def rotation_errors(omega: Array, covariance: Array, time: Array, correlation: f
         return errors
     if n:
         errors[0] = 0.0
-    typical = np.median(covariance[known], axis=0)
     filled = _filled(np.where(known[:, None], omega, np.nan), time)
+    # what is bridged may be off by much of the rate itself
+    guessed = np.eye(3) * (_BRIDGED * np.median(np.linalg.norm(filled, axis=1))) ** 2
     total = np.zeros((3, 3))
     # an error δ of R, as R exp([δ]×), obeys δ' = δ × ω + δω
     h = np.diff(time)
     carried = Rotation.from_rotvec(-filled[:-1] * h[:, None]).as_matrix()
     for i in range(n - 1):
-        added = covariance[i] if known[i] else typical
+        added = covariance[i] if known[i] else guessed
         total = carried[i] @ total @ carried[i].T + correlation * h[i] ** 2 * added
         errors[i + 1] = np.sqrt(np.diagonal(total))
     return errors

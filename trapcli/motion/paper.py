@@ -36,7 +36,9 @@ _GROUPS = 4  # groups of rings that have windows of their own
 _SERIES = 12  # series of a group on which its windows are chosen
 _CHUNK = 128  # frames solved at once
 _LANDSCAPES = 6  # frames whose Φ is kept
+_WHITE = 2.0  # ratio of the noise's variance between pixels and between frames up to which it is white in time
 _NO_TILT = 2.0  # `FirstOrder.excess` up to which nothing speaks for α > 0
+_AT_REST = 1e-9  # turn per frame below which nothing turns, however small the noise [rad]
 _OPEN = 0.5  # share of directions that are as good, beyond which φ is not determined at all
 _SIGNIFICANT = 3.0  # standard deviations
 _ALPHA_SIGNIFICANT = 2.0
@@ -147,14 +149,17 @@ def rotation_rates(
     n = len(reduced.time)
     derivatives = _Derivatives.choose(reduced, window)
     first, line, landscape = _solve_lines(reduced, derivatives, frame, progress)
-    spinning = first.structured & (first.excess < _NO_TILT)
+    step = _step(reduced.time)
+    inflation = derivatives.inflation(n, 1)
+    untilted = (first.excess < _NO_TILT * inflation**2) | (first.pace * step < _AT_REST)
+    spinning = first.structured & untilted
     tilted = first.structured & ~spinning & (first.open_share < _OPEN)
     phi = unwrap_directions(np.where(tilted, first.phi, np.nan), tilted & ~first.ambiguous)
     omega_3 = np.where(tilted, first.omega_3, np.nan)
+    scale = np.sqrt(np.maximum(first.misfit, inflation**2))
     phi_errors, omega_3_errors = (
-        np.where(tilted, np.sqrt(first.covariance[:, i, i]), np.nan) for i in (0, 1)
+        np.where(tilted, np.sqrt(first.covariance[:, i, i]) * scale, np.nan) for i in (0, 1)
     )
-    step = _step(reduced.time)
     sigma, sigma_error = _series_rate(phi, phi_errors, derivatives.kernel, step, window)
     change, change_error = _series_rate(omega_3, omega_3_errors, derivatives.kernel, step, window)
     third = third_order.solve(
@@ -165,12 +170,13 @@ def rotation_rates(
         derivatives.errors,
         sigma_error=sigma_error,
         omega_3_rate_error=change_error,
+        inflation=derivatives.inflation(n, 2),
     )
     silent = _silent(omega_3, sigma, np.hypot(omega_3_errors, sigma_error), third)
     faint = tilted & ~silent & ~(third.alpha_squared > _ALPHA_SIGNIFICANT * third.errors)
     alpha = np.sqrt(np.where(tilted & ~silent & ~faint, third.alpha_squared, np.nan))
     flags = np.zeros(n, np.uint16)
-    flags[first.ambiguous | (~spinning & ~tilted & np.isfinite(first.phi))] |= np.uint16(Flag.AMBIGUOUS_PHI)
+    flags[(first.ambiguous & ~spinning) | (~spinning & ~tilted & np.isfinite(first.phi))] |= np.uint16(Flag.AMBIGUOUS_PHI)
     flags[spinning | faint] |= np.uint16(Flag.ALPHA_ZERO)
     flags[silent] |= np.uint16(Flag.THIRD_ORDER_SILENT)
     return RotationRates(
@@ -178,28 +184,27 @@ def rotation_rates(
         omega_3=np.where(spinning, first.common_height, omega_3),
         alpha=alpha,
         phi_errors=phi_errors,
-        omega_3_errors=np.where(spinning, first.common_error, omega_3_errors),
+        omega_3_errors=np.where(spinning, first.common_error * inflation, omega_3_errors),
         alpha_errors=third.errors / (2 * alpha),
         flags=flags,
         residual=first.residual,
         spinning=spinning,
-        window=derivatives.rate_width,
+        window=len(derivatives.kernel),
         landscape=landscape,
     )
 
 
 @dataclass(frozen=True)
 class _Derivatives:
-    """Filters for J̃, ∂tJ̃ and ∂ttJ̃, each for groups of rings, and the errors they leave.
-
-    `kernel` are the weights of the rate's filter in the group that says most, far from the ends.
-    """
+    """Filters for J̃, ∂tJ̃ and ∂ttJ̃, each for groups of rings, and the errors they leave far from the ends."""
 
     groups: list[slice]
     filters: list[tuple[TimeFilter, ...]]
     errors: RingErrors
+    decisive: int
+    """The group that says most about the motion."""
     kernel: Array
-    rate_width: int
+    """Weights of its filter for ∂tJ̃, far from the ends."""
 
     @classmethod
     def choose(cls, reduced: ReducedMap, window: int) -> _Derivatives:
@@ -211,22 +216,34 @@ class _Derivatives:
         filters = []
         errors = np.empty((3, rings))
         energy = []
+        lasting = np.empty((3, rings))
         for group in groups:
             series = reduced.samples[:, group].reshape(n, -1)
             series = series[:, :: max(1, series.shape[1] // _SERIES)]
             noise = difference_noise(reduced.samples[:, group, :: max(1, lines // 16)].reshape(n, -1))
             filters.append(choose_filters(series, (0, 1, 2), noise=noise, width=window))
             errors[:, group] = [[f.error / step**f.order] for f in filters[-1]]
+            # what the pixels' noise has beyond the noise seen from frame to frame moves with the object
+            slow = np.sqrt(max(reduced.noise**2 - _WHITE * noise**2, 0.0))
+            pace = np.array([_rms(f.apply(series, 1.0)) for f in filters[-1]]) / step ** np.arange(3)
+            lasting[:, group] = (slow * pace / max(pace[0], 1e-300))[:, None]
             energy.append(
                 np.nanmean(np.abs(series - np.nanmean(series, axis=0)) ** 2) / filters[-1][1].error ** 2
             )
         # a filter that leaves no error at all (a series of zeros) must not have infinite weight
+        errors = np.hypot(errors, lasting)
         errors = np.maximum(errors, np.finfo(float).eps * errors.max(axis=1, keepdims=True) + 1e-300)
-        rate = filters[int(np.argmax(energy))][1]
-        weights = list(rate.rows(n, frames=range(n // 2, n // 2 + 1)))[0][1]
+        decisive = int(np.argmax(energy))
+        _, kernel = next(iter(filters[decisive][1].rows(n, frames=range(n // 2, n // 2 + 1))))
         share = min(1.0, (reduced.mu[1] - reduced.mu[0]) * reduced.radius / np.pi)
         ring_errors = RingErrors(reduced.mu, MARGIN * reduced.radius, *errors, share=share)
-        return cls(groups, filters, ring_errors, weights, len(weights))
+        return cls(groups, filters, ring_errors, decisive, kernel)
+
+    def inflation(self, n: int, order: int) -> Array:
+        """Return the ``(n,)`` errors of a derivative in units of those far from the ends."""
+        gains = self.filters[self.decisive][order].gains(n)
+        ratio: Array = np.maximum(gains / gains[n // 2], 1.0)
+        return ratio
 
     def apply(self, reduced: ReducedMap, valid: Bools, frames: range) -> list[NDArray[Any]]:
         """Return J̃, ∂tJ̃ and ∂ttJ̃ of some frames, ``(n, M, L)`` each."""
@@ -326,7 +343,9 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
     # where nothing speaks for a tilt φ is not known, but not needed either
     direction = np.where(rates.spinning, 0.0, rates.phi)
     omega = np.stack([tilt * np.cos(direction), tilt * np.sin(direction), rates.omega_3], axis=-1)
-    moving = ~rates.spinning | (np.abs(rates.omega_3) > _SIGNIFICANT * rates.omega_3_errors)
+    omega[flags & np.uint16(Flag.AMBIGUOUS_PHI) > 0] = np.nan
+    least = np.maximum(_SIGNIFICANT * rates.omega_3_errors, _AT_REST / _step(time))
+    moving = ~rates.spinning | (np.abs(rates.omega_3) > least)
     valid = np.isfinite(omega).all(axis=1) & moving & (flags & ~np.uint16(Flag.ALPHA_ZERO) == 0)
     identifiable = bool(valid.mean() >= _OPEN) if len(valid) else False
     T = translation(centers.center)
@@ -339,11 +358,11 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
         omega_3=rates.omega_3,
         alpha=rates.alpha,
         R=integrate_rotation(omega, time, bridge=max(_SHORTEST_BRIDGE, rates.window // 2)),
-        T_errors=centers.errors,
+        T_errors=np.hypot(centers.errors, _first(centers.errors)),
         phi_errors=rates.phi_errors,
         omega_3_errors=rates.omega_3_errors,
         alpha_errors=rates.alpha_errors,
-        R_errors=rotation_errors(omega, _covariance(rates, direction, tilt), time, 1.0),
+        R_errors=rotation_errors(omega, _covariance(rates, direction, tilt), time, rates.window / 2),
         valid=valid.astype(np.uint8),
         flags=flags,
         residual=rates.residual,
@@ -351,6 +370,12 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
         verdict=_verdict(valid, flags, rates, blank),
         landscape=rates.landscape,
     )
+
+
+def _first(series: Array) -> Array:
+    """Return the first row without NaN; NaN where there is none."""
+    known = np.flatnonzero(np.isfinite(series).all(axis=1))
+    return series[known[0]] if len(known) else np.full(series.shape[1], np.nan)
 
 
 def _covariance(rates: RotationRates, direction: Array, tilt: Array) -> Array:
@@ -388,6 +413,10 @@ def _verdict(valid: Bools, flags: NDArray[np.uint16], rates: RotationRates, blan
     told = [f"{text} ({int(which.sum())} frames)" for which, text in reasons if which.sum() > 0.05 * seen]
     summary = f"motion found in {int(valid.sum())} of {len(valid)} frames"
     return "; ".join([summary, *told])
+
+
+def _rms(series: NDArray[Any]) -> float:
+    return float(np.sqrt(np.nanmean(np.abs(series) ** 2)))
 
 
 def _step(time: Array) -> float:

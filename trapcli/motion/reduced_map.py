@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.errors import InputError
-from trapcli.motion.centers import TAPER, Centers, Progress, disc, sample_frames
-from trapcli.motion.time_derivatives import difference_noise
+from trapcli.motion.centers import TAPER, Centers, Progress, disc
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.frames import Frames
 
@@ -105,10 +104,7 @@ def reduce_frames(
             if progress is not None:
                 progress("reduced map", done, len(attenuation))
     noise = transform.noise_gain * centers.noise
-    measured = difference_noise(samples.reshape(len(samples), -1)[:, :: max(1, samples[0].size // 400)])
-    return ReducedMap(
-        samples, grid.mu, grid.phi, time, min(noise, measured) if len(samples) > 8 else noise, centers.radius
-    )
+    return ReducedMap(samples, grid.mu, grid.phi, time, noise, centers.radius)
 
 
 class _PolarTransform:

@@ -109,6 +109,7 @@ def solve(
     *,
     sigma_error: Array,
     omega_3_rate_error: Array,
+    inflation: Array,
 ) -> ThirdOrder:
     """Solve the third-order equation for α² and α'/α by least squares over μ (``propD3``; Elbau et al. 2020).
 
@@ -122,6 +123,8 @@ def solve(
         Errors of the map, ring by ring.
     sigma_error, omega_3_rate_error:
         ``(n,)`` 1-σ errors of σ and ω₃'.
+    inflation:
+        ``(n,)`` errors of ∂ttJ̃ in units of `errors`; more than 1 near the ends.
     """
     constant, by_square, by_log_rate = coefficients(line, omega_3, sigma, omega_3_rate)
     matrix = np.stack([by_square, by_log_rate], axis=-1)
@@ -134,8 +137,8 @@ def solve(
     by_change = np.einsum("nij,nmj,nm->ni", inverse, weighted, line.curvature).real
     residual = constant + np.einsum("nmi,ni->nm", matrix, solution)
     chi2 = np.einsum("nm,nm->n", _weights(errors, omega_3, sigma, omega_3_rate), np.abs(residual) ** 2)
-    scale = np.maximum(chi2 / max(2 * errors.share * len(errors.mu) - 2, 1.0), 1.0)
-    variance = inverse[:, 0, 0] * scale
+    misfit = chi2 / max(2 * errors.share * len(errors.mu) - 2, 1.0)
+    variance = inverse[:, 0, 0] * np.maximum(misfit, inflation**2)
     variance += (by_sigma[:, 0] * sigma_error) ** 2 + (by_change[:, 0] * omega_3_rate_error) ** 2
     return ThirdOrder(solution[:, 0], np.sqrt(variance), solution[:, 1])
 
