@@ -46,7 +46,7 @@ class PlaneReader:
     """
 
     def __init__(self, name: str, page: Any, planes: list[Segments]) -> None:
-        """`page` is a page as tifffile describes it, which stands for all."""
+        """`page` is a page as tifffile describes it, which stands for all; its file must be open now only."""
         separate, depth, self.height, self.width, contiguous = page.shaped
         if depth != 1:
             raise InputError(f"{name}: its pages hold volumes; save it as a stack of plane pages")
@@ -55,6 +55,7 @@ class PlaneReader:
         self.dtype: np.dtype[Any] = np.dtype(page.dtype)
         self._name = name
         self._page = page
+        self._decode = page.decode
         self._stored = self.dtype.newbyteorder(page.parent.byteorder)
         self._planes = [self._checked(position, plane) for position, plane in enumerate(planes)]
 
@@ -104,7 +105,7 @@ class PlaneReader:
         for index, (offset, count) in enumerate(zip(plane.offsets, plane.counts, strict=True)):
             file.seek(int(offset))
             data = file.read(int(count))
-            segment, (s, d, h, w, _), shape = page.decode(data, index, jpegtables=page.jpegtables)
+            segment, (s, d, h, w, _), shape = self._decode(data, index, jpegtables=page.jpegtables)
             target = pixels[s, d : d + shape[0], h : h + shape[1], w : w + shape[2]]
             target[...] = segment[: page.imagedepth - d, : page.imagelength - h, : page.imagewidth - w]
         return pixels

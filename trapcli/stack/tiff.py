@@ -80,6 +80,7 @@ def write_tiff(
     size = shape[0] * shape[1] * shape[2] * dtype.itemsize
     imagej = (
         dtype in (np.uint8, np.uint16, np.float32)
+        and shape[2] > 1  # tifffile takes a last axis of 1 for colours
         and size < CLASSIC_TIFF_LIMIT
         and (pixel_size is None or _RATIONAL_PIXEL_SIZES[0] < pixel_size < _RATIONAL_PIXEL_SIZES[1])
     )
@@ -235,32 +236,41 @@ def _whole_or_part(name: str, tiff: tifffile.TiffFile, chains: _Chains, allow_pa
 
 def _layout(name: str, tiff: tifffile.TiffFile, chains: _Chains) -> _Layout:
     """Take what tifffile makes of the file, after checking it against what is there."""
-    if len(tiff.series) != 1:
-        kinds = ", ".join("x".join(map(str, series.shape)) for series in tiff.series[:4]) or "none"
-        raise InputError(f"{name}: its pages change size or type ({kinds}); save the wanted ones alone")
-    series = tiff.series[0]
+    path = Path(tiff.filehandle.path)
+    chain = chains.chain(path)
+    series = _only_series(name, tiff, chain)
     page = series.keyframe
     _check_page(name, page)
     axes, sizes = _plane_axes(name, series)
     count = math.prod(sizes)
     check_frame_count(name, count)
-    path = Path(tiff.filehandle.path)
-    chain = chains.chain(path)
-    if series.dataoffset is None:
+    start = series.dataoffset
+    if start is None:
         planes = _listed_planes(name, series, chains)
     else:
-        planes = _adjacent_planes(path, series.dataoffset, page.nbytes, count, chain.size)
-        end = series.dataoffset + count * page.nbytes
-        within = [p for p in chain.pages if len(p.offsets) and series.dataoffset <= p.offsets[0] < end]
+        planes = _adjacent_planes(path, start, page.nbytes, count, chain.size)
+        end = start + count * page.nbytes
+        within = [other for other in chain.pages if len(other.offsets) and start <= other.offsets[0] < end]
         _check_alike(name, chains.page(path, page.offset), within)
     declared = max(count, _declared_images(tiff, page))
     if len(planes) < declared:
-        raise InputError(
-            f"{name}: truncated: it declares {declared} frames and has {len(planes)}; {PARTIAL_HINT}"
-        )
+        shortage = f"it declares {declared} frames and has {len(planes)}"
+        raise InputError(f"{name}: truncated: {shortage}; {PARTIAL_HINT}")
     surplus = len(chain.pages) - count
     warnings = (f"it has {surplus} pages more than its description counts, which aren't read",)
     return _Layout(page, axes, sizes, planes, warnings if surplus > 0 else ())
+
+
+def _only_series(name: str, tiff: tifffile.TiffFile, chain: Chain) -> tifffile.TiffPageSeries:
+    try:
+        found = tiff.series
+    except RuntimeError:  # pages of different widths where all should be alike
+        _check_alike(name, chain.pages[0], chain.pages)
+        raise
+    if len(found) != 1:
+        kinds = ", ".join("x".join(map(str, series.shape)) for series in found[:4]) or "none"
+        raise InputError(f"{name}: its pages change size or type ({kinds}); save the wanted ones alone")
+    return found[0]
 
 
 def _salvaged(name: str, tiff: tifffile.TiffFile, chain: Chain) -> _Layout:

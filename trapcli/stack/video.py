@@ -82,6 +82,8 @@ def write_avi(
             f"FFV1 frames need an even width and height, not {shape[2]} x {shape[1]} (OpenCV crops them); "
             "use the codec raw, or write a TIFF"
         )
+    if codec == "ffv1" and Path(path).suffix.lower() != ".avi":
+        raise ConfigError(f"{path}: must end in .avi, by which OpenCV chooses the container; or write a TIFF")
     if not 1e-3 <= fps <= 1e6:
         raise ConfigError(f"{fps} frames per second can't be written in an AVI; write a TIFF instead")
     frames = single_frames(blocks, shape, np.dtype(f"u{bits // 8}"))
