@@ -264,7 +264,7 @@ def _is_mirrored(a: Motion, b: Motion, usable: NDArray[np.bool_]) -> bool:
 
 
 def _statistics(unit: str, error: Array, sigma: Array, scale: float) -> ErrorStatistics:
-    error, sigma = error.reshape(len(error), -1), sigma.reshape(len(sigma), -1)
+    error, sigma = (values[:, None] if values.ndim == 1 else values for values in (error, sigma))
     known = np.isfinite(error).all(axis=1)
     size = scale * np.linalg.norm(error[known], axis=1)
     stated = np.isfinite(error) & np.isfinite(sigma) & (sigma > 0)
