@@ -13,45 +13,15 @@ import pytest
 from trapcli.cli.main import run
 from trapcli.result.motion import Motion
 
+# fmt: off
 COLUMNS = [
-    "frame",
-    "time",
-    "T1",
-    "T2",
-    "T1_errors",
-    "T2_errors",
-    "center1",
-    "center2",
-    "phi",
-    "phi_errors",
-    "omega_1",
-    "omega_2",
-    "omega_3",
-    "omega_3_errors",
-    "alpha",
-    "alpha_errors",
-    "R11",
-    "R12",
-    "R13",
-    "R21",
-    "R22",
-    "R23",
-    "R31",
-    "R32",
-    "R33",
-    "R1_errors",
-    "R2_errors",
-    "R3_errors",
-    "quaternion_x",
-    "quaternion_y",
-    "quaternion_z",
-    "quaternion_w",
-    "valid",
-    "flags",
-    "residual",
-    "time_unit",
-    "length_unit",
+    "frame", "time", "T1", "T2", "T1_errors", "T2_errors", "center1", "center2", "phi",
+    "phi_errors", "omega_1", "omega_2", "omega_3", "omega_3_errors", "alpha", "alpha_errors",
+    "R11", "R12", "R13", "R21", "R22", "R23", "R31", "R32", "R33", "R1_errors", "R2_errors",
+    "R3_errors", "quaternion_x", "quaternion_y", "quaternion_z", "quaternion_w", "valid", "flags",
+    "residual", "time_unit", "length_unit",
 ]
+# fmt: on
 
 
 @pytest.fixture
