@@ -1,7 +1,8 @@
 """Centres C₂ of the frames (``eq:c2``), exact on clean frames and weighted around the object on noisy ones.
 
-One rule serves both: the centroid is taken inside a smooth disc about itself, as wide as the object stands out of the
-noise. Without noise that is the whole frame and the plain centroid; with noise the disc keeps out what is not object.
+One rule serves both: the centroid is taken inside a smooth disc about itself, as wide as the object stands out of
+the noise. Without noise that is the whole frame and the plain centroid; with noise the disc keeps out what is not
+object.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ _VISIBLE = 0.06  # least power of a ring that counts as object, in units of the 
 _SIGNIFICANT = 5.0  # standard deviations
 _BLANK = 0.02  # share of the median mass below which a frame holds no object
 _CLIPPED = 0.01  # mean attenuation on one side of the frame, as a share of the frame's highest
+_OUTSIDE = 0.1  # share of the frame outside the object's disc that tells the level of the empty field
 _CONVERGED = 1e-9  # [pixels]
 _MOST_STEPS = 50
 
@@ -40,10 +42,12 @@ class Centers:
     Attributes
     ----------
     center, errors:
-        ``(N, 2)`` C₂ as (x1, x2) from pixel ``(H//2, W//2)`` and its 1-σ error from pixel noise [length]; NaN in
-        blank frames. Smoothed in time where the noise, not the motion, makes it rough.
+        ``(N, 2)`` C₂ as (x1, x2) from pixel ``(H//2, W//2)`` and its 1-σ error from pixel noise [length]; NaN
+        in blank frames. Smoothed in time where the noise, not the motion, makes it rough.
     mass:
-        ``(N,)`` integral of the attenuation over the frame; 0 in blank frames.
+        ``(N,)`` integral of the attenuation over the object's disc; 0 in blank frames.
+    level:
+        ``(N,)`` mean attenuation of the empty field around the object, to be subtracted.
     noise:
         Standard deviation of the noise of one pixel [attenuation].
     radius:
@@ -55,6 +59,7 @@ class Centers:
     center: Array
     errors: Array
     mass: Array
+    level: Array
     noise: float
     radius: float
     clipped: NDArray[np.bool_]
@@ -78,16 +83,17 @@ def estimate_centers(
     noise = pixel_noise(survey)
     radius = object_radius(survey, noise)
     n = len(attenuation)
-    center, mass, clipped = np.full((n, 2), np.nan), np.zeros(n), np.zeros(n, bool)
+    center = np.full((n, 2), np.nan)
+    mass, level, clipped = np.zeros(n), np.zeros(n), np.zeros(n, bool)
     done = 0
     previous: Array | None = None
     for block in attenuation.blocks():
         for image in block:
-            found = _center(image, noise, radius, previous)
+            found = _find(image, noise, radius, previous)
             if found is not None:
-                previous, mass[done] = found
+                previous, mass[done], level[done] = found
                 center[done] = previous
-                clipped[done] = _touches_edge(image, noise)
+                clipped[done] = _touches_edge(image, noise, level[done])
             done += 1
         if progress is not None:
             progress("centers", done, n)
@@ -96,8 +102,165 @@ def estimate_centers(
         center[faint], mass[faint] = np.nan, 0.0
     center, errors = _smooth(center, mass, noise * _lever(attenuation.shape[1:], radius))
     return Centers(
-        center * pixel_size, errors * pixel_size, mass * pixel_size**2, noise, radius * pixel_size, clipped
+        center=center * pixel_size,
+        errors=errors * pixel_size,
+        mass=mass * pixel_size**2,
+        level=level,
+        noise=noise,
+        radius=radius * pixel_size,
+        clipped=clipped,
     )
+
+
+def sample_frames(frames: Frames, count: int = _SURVEY) -> NDArray[Any]:
+    """Return at most `count` frames spread evenly over the stack, ``(K, H, W)``; those with NaN are left out."""
+    wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+    images = [image for image in pick_frames(frames, wanted) if np.isfinite(image).all()]
+    return np.array(images).reshape(-1, *frames.shape[1:])
+
+
+def pick_frames(frames: Frames, wanted: NDArray[np.integer[Any]]) -> list[NDArray[Any]]:
+    """Read the stack once and return the frames of ascending positions `wanted`."""
+    kept: list[NDArray[Any]] = []
+    done = 0
+    for block in frames.blocks():
+        inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
+        kept.extend(np.array(block[i]) for i in inside)
+        done += len(block)
+    return kept
+
+
+def pixel_noise(images: NDArray[Any]) -> float:
+    """Return the standard deviation of white noise in ``(K, H, W)`` images.
+
+    It is read off the corners of their Fourier transforms, beyond the circle that a smooth object keeps inside.
+    """
+    if not len(images) or min(images.shape[1:]) < 4:
+        return 0.0
+    k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
+    k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
+    corner = np.minimum(k1, k2) > 0.7
+    window = np.hanning(images.shape[1])[:, None] * np.hanning(images.shape[2])
+    powers = [
+        np.median(np.abs(np.fft.rfft2(image * window))[corner] ** 2) / np.log(2) / np.sum(window**2)
+        for image in images.astype(float)
+    ]
+    return float(np.sqrt(np.median(powers)))
+
+
+def object_radius(images: NDArray[Any], noise: float) -> float:
+    """Return the distance from the centre up to which the object stands out of the noise [pixels].
+
+    Parameters
+    ----------
+    images:
+        ``(K, H, W)`` attenuation.
+    noise:
+        Standard deviation of the noise of one pixel.
+    """
+    radius = farthest = float(np.hypot(*images.shape[1:]))
+    for _ in range(3):
+        profiles = [_radial_profile(image, noise, radius) for image in images]
+        pixels, power = np.sum(profiles, axis=0) if profiles else np.zeros((2, 1))
+        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1)))
+        seen = np.flatnonzero(power > least * noise**2 * pixels)
+        if not len(seen):
+            return farthest
+        radius = min(_RING * (seen[-1] + 1.0), farthest)
+    return radius
+
+
+def disc(shape: tuple[int, ...], center: Array, radius: float) -> tuple[Array, slice, slice]:
+    """Return a smooth disc, 1 inside `radius` and 0 beyond `TAPER` radii, and the rows and columns it covers.
+
+    Parameters
+    ----------
+    shape:
+        ``(H, W)`` of the frame.
+    center, radius:
+        In pixels, from pixel ``(H//2, W//2)``.
+    """
+    x1, x2 = _axes(shape)
+    reach = TAPER * radius
+    rows = _inside(np.abs(x2 - center[1]) <= reach)
+    columns = _inside(np.abs(x1 - center[0]) <= reach)
+    r2 = (x2[rows, None] - center[1]) ** 2 + (x1[columns] - center[0]) ** 2
+    ramp = np.clip((reach**2 - r2) / (reach**2 - radius**2), 0.0, 1.0)
+    weights: Array = ramp**2 * (3 - 2 * ramp)
+    return weights, rows, columns
+
+
+def _find(
+    image: NDArray[Any], noise: float, radius: float, start: Array | None
+) -> tuple[Array, float, float] | None:
+    """Return centre [pixels], mass and level of one frame; None where nothing stands out of the noise."""
+    if not np.isfinite(image).all():
+        return None
+    image = image.astype(float)
+    border = float(np.median(np.concatenate([image[:2].ravel(), image[-2:].ravel()])))
+    outside = _outside_share(image.shape, radius) > _OUTSIDE
+    level = border if outside else 0.0
+    center = _brightest(image - border) if start is None else start
+    found = _centroid(image, level, noise, radius, center)
+    if found is not None and outside:
+        level = _level(image, noise, radius, found[0])
+        found = _centroid(image, level, noise, radius, found[0])
+    if found is None:
+        return None if start is None else _find(image, noise, radius, None)
+    return (*found, level)
+
+
+def _centroid(
+    image: Array, level: float, noise: float, radius: float, center: Array
+) -> tuple[Array, float] | None:
+    """Iterate the weighted centroid from a start; None where the mass does not stand out of the noise."""
+    x1, x2 = _axes(image.shape)
+    mass = 0.0
+    for _ in range(_MOST_STEPS):
+        weights, rows, columns = disc(image.shape, center, radius)
+        weighted = (image[rows, columns] - level) * weights
+        mass = float(weighted.sum())
+        if not mass > _SIGNIFICANT * noise * np.linalg.norm(weights):
+            return None
+        old = center
+        moments = weighted.sum(axis=0) @ x1[columns], weighted.sum(axis=1) @ x2[rows]
+        center = np.array(moments) / mass
+        if np.abs(center - old).max() < _CONVERGED:
+            break
+    return center, mass
+
+
+def _radial_profile(image: NDArray[Any], noise: float, radius: float) -> Array:
+    """Return the pixels and their power beyond the noise in rings about the centre, ``(2, K)``."""
+    rings = int(np.hypot(*image.shape) / _RING) + 1
+    # the border stands in for the empty field until the radius is known
+    border = np.median(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]))
+    found = _find(image - border, noise, radius, None)
+    if found is None:
+        return np.zeros((2, rings))
+    x1, x2 = _axes(image.shape)
+    ring = (np.hypot(x1 - found[0][0], (x2 - found[0][1])[:, None]) / _RING).astype(int).ravel()
+    power = ((image - border - found[2]) ** 2 - noise**2).ravel()
+    return np.stack([np.bincount(ring, minlength=rings)[:rings], np.bincount(ring, power, rings)[:rings]])
+
+
+def _level(image: Array, noise: float, radius: float, center: Array) -> float:
+    """Return the mean of the empty field, of what is like most of it: another particle does not count."""
+    stride = max(1, min(image.shape) // 256)
+    x1, x2 = _axes(image.shape)
+    r2 = (x2[::stride, None] - center[1]) ** 2 + (x1[::stride] - center[0]) ** 2
+    outside = image[::stride, ::stride][r2 > (TAPER * radius) ** 2]
+    if not len(outside):
+        return 0.0
+    typical = np.abs(outside - np.median(outside)) <= _SIGNIFICANT * noise
+    return float(outside[typical].mean())
+
+
+def _outside_share(shape: tuple[int, ...], radius: float) -> float:
+    """Return the share of the frame that a disc about its middle leaves outside."""
+    x1, x2 = _axes(shape)
+    outside: NDArray[np.bool_] = x1**2 + (x2**2)[:, None] > (TAPER * radius) ** 2
+    return float(outside.mean())
 
 
 def _smooth(center: Array, mass: Array, moment_noise: float) -> tuple[Array, Array]:
@@ -115,119 +278,6 @@ def _smooth(center: Array, mass: Array, moment_noise: float) -> tuple[Array, Arr
     return center, errors
 
 
-def sample_frames(frames: Frames, count: int = _SURVEY) -> NDArray[np.floating[Any]]:
-    """Return at most `count` frames spread evenly over the stack, ``(K, H, W)``; frames with NaN are left out."""
-    wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    kept: list[NDArray[Any]] = []
-    done = 0
-    for block in frames.blocks():
-        inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
-        kept.extend(np.array(block[i]) for i in inside)
-        done += len(block)
-    return np.array([image for image in kept if np.isfinite(image).all()]).reshape(-1, *frames.shape[1:])
-
-
-def pixel_noise(images: NDArray[np.floating[Any]]) -> float:
-    """Return the standard deviation of white noise in ``(K, H, W)`` images.
-
-    It is read off the corners of their Fourier transforms, beyond the circle that any smooth object keeps inside.
-    """
-    if not len(images) or min(images.shape[1:]) < 4:
-        return 0.0
-    k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
-    k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
-    corner = np.minimum(k1, k2) > 0.7
-    window = np.hanning(images.shape[1])[:, None] * np.hanning(images.shape[2])
-    powers = [
-        np.median(np.abs(np.fft.rfft2(image * window))[corner] ** 2) / np.log(2) / np.sum(window**2)
-        for image in images.astype(float)
-    ]
-    return float(np.sqrt(np.median(powers)))
-
-
-def object_radius(images: NDArray[np.floating[Any]], noise: float) -> float:
-    """Return the distance from the centre up to which the object stands out of the noise [pixels].
-
-    Parameters
-    ----------
-    images:
-        ``(K, H, W)`` attenuation.
-    noise:
-        Standard deviation of the noise of one pixel.
-    """
-    radius = farthest = float(np.hypot(*images.shape[1:]))
-    for _ in range(3):
-        profiles = np.array([_radial_profile(image, noise, radius) for image in images])
-        pixels, power = profiles.sum(axis=0) if len(profiles) else np.zeros((2, 1))
-        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1)))
-        seen = np.flatnonzero(power > least * noise**2 * pixels)
-        if not len(seen):
-            return farthest
-        radius = min(_RING * (seen[-1] + 1.0), farthest)
-    return radius
-
-
-def _radial_profile(image: NDArray[np.floating[Any]], noise: float, radius: float) -> Array:
-    """Return the pixels and their power beyond the noise in rings about the centre, ``(2, K)``."""
-    rings = int(np.hypot(*image.shape) / _RING) + 1
-    found = _center(image, noise, radius, None)
-    if found is None:
-        return np.zeros((2, rings))
-    x1, x2 = _axes(image.shape)
-    ring = (np.hypot(x1 - found[0][0], (x2 - found[0][1])[:, None]) / _RING).astype(int).ravel()
-    power = (image.astype(float) ** 2 - noise**2).ravel()
-    return np.stack([np.bincount(ring, minlength=rings)[:rings], np.bincount(ring, power, rings)[:rings]])
-
-
-def _center(
-    image: NDArray[np.floating[Any]], noise: float, radius: float, start: Array | None
-) -> tuple[Array, float] | None:
-    """Return the centre of one frame [pixels] and its mass; None where nothing stands out of the noise."""
-    if not np.isfinite(image).all():
-        return None
-    center = _brightest(image) if start is None else start
-    for _ in range(_MOST_STEPS):
-        weights, rows, columns = disc(image.shape, center, radius)
-        weighted = image[rows, columns] * weights
-        mass = float(weighted.sum(dtype=float))
-        if not mass > _SIGNIFICANT * noise * np.linalg.norm(weights):
-            return None if start is None else _center(image, noise, radius, None)
-        x1, x2 = _axes(image.shape)
-        old = center
-        center = np.array(
-            [
-                weighted.sum(axis=0, dtype=float) @ x1[columns] / mass,
-                weighted.sum(axis=1, dtype=float) @ x2[rows] / mass,
-            ]
-        )
-        if np.abs(center - old).max() < _CONVERGED:
-            break
-    return center, mass
-
-
-def disc(
-    shape: tuple[int, ...], center: Array, radius: float, taper: float = TAPER
-) -> tuple[Array, slice, slice]:
-    """Return a smooth disc, 1 inside `radius` and 0 beyond `taper` radii, and the rows and columns it covers.
-
-    Parameters
-    ----------
-    shape:
-        ``(H, W)`` of the frame.
-    center, radius:
-        In pixels, from pixel ``(H//2, W//2)``.
-    """
-    x1, x2 = _axes(shape)
-    reach = taper * radius
-    rows = _inside(np.abs(x2 - center[1]) <= reach)
-    columns = _inside(np.abs(x1 - center[0]) <= reach)
-    r2 = (x2[rows, None] - center[1]) ** 2 + (x1[columns] - center[0]) ** 2
-    if r2.size and r2.max() <= radius**2:
-        return np.ones_like(r2), rows, columns
-    ramp = np.clip((reach**2 - r2) / (reach**2 - radius**2), 0.0, 1.0)
-    return ramp**2 * (3 - 2 * ramp), rows, columns
-
-
 def _inside(mask: NDArray[np.bool_]) -> slice:
     found = np.flatnonzero(mask)
     return slice(found[0], found[-1] + 1) if len(found) else slice(0, 0)
@@ -239,7 +289,7 @@ def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
     return np.arange(width) - float(width // 2), np.arange(height) - float(height // 2)
 
 
-def _brightest(image: NDArray[np.floating[Any]]) -> Array:
+def _brightest(image: Array) -> Array:
     """Return roughly where the object is: the middle of what is bright after strong smoothing."""
     size = max(3, min(image.shape) // 16)
     smooth = cv2.blur(image, (size, size))
@@ -250,12 +300,14 @@ def _brightest(image: NDArray[np.floating[Any]]) -> Array:
 
 def _lever(shape: tuple[int, ...], radius: float) -> float:
     """Return the error of the first moment for unit pixel noise: the root of the sum of squared distances."""
-    weights, rows, columns = disc(shape, np.zeros(2), radius)
+    weights, _, columns = disc(shape, np.zeros(2), radius)
     x1 = _axes(shape)[0][columns]
     return float(np.sqrt(np.sum((weights * x1) ** 2)))
 
 
-def _touches_edge(image: NDArray[np.floating[Any]], noise: float) -> bool:
+def _touches_edge(image: NDArray[Any], noise: float, level: float) -> bool:
     """Tell whether attenuation on the frame's border stands out of the noise and is not a mere tail."""
-    limit = max(_CLIPPED * float(image.max()), 2 * _SIGNIFICANT * noise / np.sqrt(max(image.shape)))
-    return any(float(side.mean()) > limit for side in (image[0], image[-1], image[:, 0], image[:, -1]))
+    limit = max(_CLIPPED * (float(image.max()) - level), 2 * _SIGNIFICANT * noise / np.sqrt(max(image.shape)))
+    return any(
+        float(side.mean()) - level > limit for side in (image[0], image[-1], image[:, 0], image[:, -1])
+    )

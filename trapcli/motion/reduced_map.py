@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.errors import InputError
-from trapcli.motion.centers import TAPER, Centers, Progress, disc
+from trapcli.motion.centers import TAPER, Centers, Progress, disc, pick_frames
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.frames import Frames
 
@@ -99,7 +99,9 @@ def reduce_frames(
             place = slice(done, done + len(images))
             seen = np.isfinite(centers.center[place, 0])
             if seen.any():
-                samples[place][seen] = transform(images[seen], centers.center[place][seen])
+                samples[place][seen] = transform(
+                    images[seen], centers.center[place][seen], centers.level[place][seen]
+                )
             done += len(images)
             if progress is not None:
                 progress("reduced map", done, len(attenuation))
@@ -130,14 +132,14 @@ class _PolarTransform:
         weights = disc(self.grid.crop, np.zeros(2), self.grid.radius)[0]
         return float(np.linalg.norm(weights)) * self.grid.pixel_size**2 / (2 * np.pi)
 
-    def __call__(self, images: NDArray[Any], centers: Array) -> NDArray[Any]:
-        """Return the ``(n, M, L)`` samples of ``(n, H, W)`` frames with ``(n, 2)`` centres [length]."""
+    def __call__(self, images: NDArray[Any], centers: Array, level: Array) -> NDArray[Any]:
+        """Return ``(n, M, L)`` samples of ``(n, H, W)`` frames with ``(n, 2)`` centres [length] above ``(n,)`` levels."""
         grid, (rows, columns) = self.grid, self._cells
         b = grid.binning
         cropped = np.zeros((len(images), rows * b, columns * b))
         middle = np.empty((len(images), 2))
-        for n, (image, center) in enumerate(zip(images, centers / grid.pixel_size, strict=True)):
-            middle[n] = _cut(image, center, grid, cropped[n])
+        for n, image in enumerate(images):
+            middle[n] = _cut(image, centers[n] / grid.pixel_size, level[n], grid, cropped[n])
         cells = cropped.reshape(len(images), rows, b, columns, b).mean(axis=(2, 4)) if b > 1 else cropped
         values = self._plan(len(images)).execute(np.ascontiguousarray(cells, dtype=self.dtype))
         shift = centers - middle * grid.pixel_size
@@ -167,8 +169,8 @@ def _cell_mean(k: Array, grid: _Grid) -> Array:
     return np.asarray(np.mean(np.cos(np.multiply.outer(k, offsets)), axis=-1))
 
 
-def _cut(image: NDArray[Any], center: Array, grid: _Grid, target: Array) -> Array:
-    """Copy the weighted surroundings of the object into `target`; return where its middle cell lies [pixels]."""
+def _cut(image: NDArray[Any], center: Array, level: float, grid: _Grid, target: Array) -> Array:
+    """Copy the weighted attenuation around the object into `target`; return where its middle cell lies [pixels]."""
     height, width = image.shape
     origin = np.array([width // 2, height // 2])
     size = np.array([grid.crop[1], grid.crop[0]])
@@ -177,7 +179,7 @@ def _cut(image: NDArray[Any], center: Array, grid: _Grid, target: Array) -> Arra
     inside = image[top : top + rows, left : left + columns]
     # `disc` counts from the middle pixel of what it is given
     weights, row_slice, column_slice = disc(inside.shape, center + origin - corner - size // 2, grid.radius)
-    target[row_slice, column_slice] = inside[row_slice, column_slice] * weights
+    target[row_slice, column_slice] = (inside[row_slice, column_slice] - level) * weights
     b = grid.binning
     cells = np.array([target.shape[1] // b // 2, target.shape[0] // b // 2])
     return np.asarray(corner + cells * b + (b - 1) / 2 - origin)
@@ -191,13 +193,13 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     crop = min(reach, height), min(reach, width)
     wanted = np.flatnonzero(np.isfinite(centers.center[:, 0]))
     chosen = wanted[np.unique(np.linspace(0, len(wanted) - 1, _SURVEY).round().astype(int))]
-    images = _pick(attenuation, chosen)
+    images = np.array(pick_frames(attenuation, chosen))
     finest = min(0.9 * np.pi / pixel_size, FINEST / centers.radius)
     whole = _Grid(
         crop, 1, radius, pixel_size, _rings(finest, centers.radius), _angles(int(FINEST * 1.6)), False
     )
     transform = _PolarTransform(whole)
-    survey = transform(images, centers.center[chosen])
+    survey = transform(images, centers.center[chosen], centers.level[chosen])
     noise = transform.noise_gain * centers.noise
     if band <= 0:
         band = _band(survey, whole.mu, noise)
@@ -206,16 +208,6 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     lines = _lines(survey[:, whole.mu <= mu[-1]], max(0.01 * noise, 1e-15 * highest))
     binning = max(1, int(np.pi / pixel_size / (2 * mu[-1])))
     return _Grid(crop, binning, radius, pixel_size, mu, _angles(lines), noise > _SINGLE_PRECISION * highest)
-
-
-def _pick(attenuation: Frames, chosen: NDArray[np.int64]) -> NDArray[Any]:
-    kept = []
-    done = 0
-    for block in attenuation.blocks():
-        inside = chosen[(chosen >= done) & (chosen < done + len(block))] - done
-        kept.extend(np.array(block[i]) for i in inside)
-        done += len(block)
-    return np.array(kept)
 
 
 def _rings(band: float, radius: float) -> Array:

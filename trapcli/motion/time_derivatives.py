@@ -231,7 +231,7 @@ class _Trial:
                 _against_higher_degree(w, before, d + (2 if 4 * before >= width else 1), order)
                 for w, d in zip(weights, degrees, strict=True)
             ]
-            seen = self._mean_squares(differences)
+            seen = self._mean_squares(differences, one_sided=stride == 1)
             for degree, w, difference, power in zip(degrees, weights, differences, seen, strict=True):
                 expected = self.noise**2 * _gain(difference, self.kernel)
                 variance = self.noise**2 * _gain(w, self.kernel)
@@ -243,26 +243,34 @@ class _Trial:
                     closed.add(degree)
         return best, float(np.sqrt(least))
 
-    def _mean_squares(self, filters: list[Array]) -> list[float]:
-        """Return the mean square of what each filter gives over the series; infinite for filters longer than it."""
+    def _mean_squares(self, filters: list[Array], one_sided: bool) -> list[float]:
+        """Return the mean square of what each filter gives; infinite for filters longer than the series.
+
+        One-sided filters are needed at the ends, forwards and backwards: what they give there counts if it is more.
+        """
         powers = [np.inf] * len(filters)
         for length in {len(f) for f in filters if len(f) <= len(self.series)}:
             same = [i for i, f in enumerate(filters) if len(f) == length]
-            outcome = np.abs(np.stack([filters[i] for i in same]) @ self._segments(length)) ** 2
-            for i, value in zip(
-                same, outcome.mean(axis=1) if outcome.size else [np.inf] * len(same), strict=True
-            ):
+            bank = np.stack([filters[i] for i in same])
+            pieces = self._segments(length)
+            if not pieces.size:
+                continue
+            outcome = [_mean_power(bank, pieces)]
+            if one_sided:
+                outcome[0] = (outcome[0] + _mean_power(bank[:, ::-1], pieces)) / 2
+                first, last = pieces[:, :1], pieces[:, -1:]
+                outcome.append((_mean_power(bank, first) + _mean_power(bank[:, ::-1], last)) / 2)
+            for i, value in zip(same, np.max(outcome, axis=0), strict=True):
                 powers[i] = float(value)
         return powers
 
     def _segments(self, width: int) -> NDArray[Any]:
-        """Return ``(width, P)`` pieces spread over the series, those without NaN."""
+        """Return ``(width, P, K)`` pieces spread over the series from end to end, those without NaN."""
         if width not in self._cut:
             n, k = self.series.shape
             starts = np.unique(np.linspace(0, n - width, max(16, _SAMPLES // k)).astype(int))
             pieces = self.series[starts + np.arange(width)[:, None]]
-            pieces = pieces[:, np.isfinite(pieces).all(axis=(0, 2))]
-            self._cut[width] = pieces.reshape(width, -1)
+            self._cut[width] = pieces[:, np.isfinite(pieces).all(axis=(0, 2))]
         return self._cut[width]
 
 
@@ -277,6 +285,12 @@ def _against_higher_degree(weights: Array, before: int, higher: int, order: int)
     difference = _weights(start, wider, higher, order).copy()
     difference[-before - start : -before - start + width] -= weights
     return difference
+
+
+def _mean_power(bank: Array, pieces: NDArray[Any]) -> Array:
+    """Return the mean square of the outcome of D filters, ``(D, width)``, on ``(width, P, K)`` pieces."""
+    power: Array = np.mean(np.abs(bank @ pieces.reshape(len(pieces), -1)) ** 2, axis=1)
+    return power
 
 
 def _product(matrix: Array, series: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
