@@ -49,8 +49,8 @@ class Page:
 
     Attributes
     ----------
-    offset:
-        Where it stands in the file.
+    offset, following:
+        Where it stands in the file, and where the next one should; 0 after the last.
     layout:
         The tags that say how pixels are stored, as bytes; equal for pages that are decoded alike.
     offsets, counts:
@@ -58,6 +58,7 @@ class Page:
     """
 
     offset: int
+    following: int
     layout: tuple[tuple[int, bytes], ...]
     offsets: NDArray[np.int64]
     counts: NDArray[np.int64]
@@ -119,12 +120,13 @@ class _Reader:
                 raise _Fault(f"after page {len(seen)}, its page directory loops")
             seen.add(offset)
             try:
-                page, offset = self._page(offset)
+                page = self._page(offset)
             except _Fault as fault:
                 raise _Fault(f"page {len(seen)} {fault}") from None
             yield page
+            offset = page.following
 
-    def _page(self, offset: int) -> tuple[Page, int]:
+    def _page(self, offset: int) -> Page:
         start = offset + struct.calcsize("<" + self._count)
         count = self._unpack(self._count, self._read(offset, start - offset))
         tag_size = struct.calcsize("<" + self._tag)
@@ -148,7 +150,7 @@ class _Reader:
         self._check_segments(offsets, counts)
         # pages share one tuple: there may be a million of them
         shared = self._layouts.setdefault(tuple(layout), tuple(layout))
-        return Page(offset, shared, offsets, counts), following
+        return Page(offset, following, shared, offsets, counts)
 
     def _check_segments(self, offsets: NDArray[np.int64], counts: NDArray[np.int64]) -> None:
         if len(counts) and len(counts) != len(offsets):

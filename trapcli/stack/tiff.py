@@ -285,13 +285,25 @@ def _salvaged(name: str, tiff: tifffile.TiffFile, chain: Chain) -> _Layout:
     check_frame_count(name, declared)
     path = Path(tiff.filehandle.path)
     alike = list(itertools.takewhile(lambda other: other.layout == chain.pages[0].layout, chain.pages))
-    if page.is_final and len(alike) == 1 and declared > 1:
+    if page.is_final and declared > 1 and _are_adjacent(alike, page.nbytes, declared):
         planes = _adjacent_planes(path, page.dataoffsets[0], page.nbytes, declared, chain.size)
     else:
         planes = [Segments(path, other.offsets, other.counts) for other in alike]
     whole = f"{declared} frames" if declared > 1 else "an unknown number of frames"
     warning = f"it is truncated or damaged: {len(planes)} of {whole} can be read"
     return _Layout(page, "T", (len(planes),), planes, (warning,))
+
+
+def _are_adjacent(pages: list[Page], length: int, declared: int) -> bool:
+    """Whether the pixels of all declared frames follow each other, with no directory in between."""
+    start = int(pages[0].offsets[0])
+    end = start + declared * length
+    if pages[-1].following == 0 and len(pages) > 1:  # nothing is cut off: the directories count the frames
+        return False
+    directories = (*(page.offset for page in pages), pages[-1].following)
+    return not any(start < directory < end for directory in directories) and all(
+        page.offsets[0] == start + k * length for k, page in enumerate(pages)
+    )
 
 
 def _check_page(name: str, page: tifffile.TiffPage) -> None:
