@@ -99,6 +99,7 @@ def _open_file(path: Path, name: str, config: InputConfig) -> Source:
     """Open a file by what is in it; its ending says nothing."""
     if not path.is_file():
         raise InputError(f"{name}: is no regular file")
+    path = path.absolute()  # passes to come may find another working folder
     with guard(name), path.open("rb") as file:
         start = file.read(16)
     if not start:
