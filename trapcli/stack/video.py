@@ -25,7 +25,7 @@ from trapcli.stack.container import video_fault
 from trapcli.stack.frames import StackInfo, single_frames
 from trapcli.stack.source import PARTIAL_HINT, Source, check_frame_bytes, guard
 
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+getattr(cv2.utils, "logging", cv2).setLogLevel(0)  # OpenCV 5 has moved it
 
 _GREY = {b"Y800": np.uint8, b"Y1\0\x10": np.uint16}
 _COLOUR = (b"BGR\x18", b"RGB\x18", b"BGR\0", b"RGB\0", b"BGRA", b"RGBA", b"G3\0\x08")
