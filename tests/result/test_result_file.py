@@ -386,6 +386,8 @@ class TestHostileFiles:
             ("angular_velocity/alpha", np.zeros(30, complex)),
             ("time", np.full(30, np.nan)),
             ("time", np.zeros(0)),
+            ("time", np.zeros(30)),
+            ("time", np.linspace(0, 1e300, 30)),
             ("time", 3.0),
             ("rotation/R", np.zeros((30, 3, 3))),
             ("rotation/R", np.full((30, 3, 3), 1e200)),
@@ -394,6 +396,7 @@ class TestHostileFiles:
             ("process/program", np.array(["a", "b"], dtype=h5py.string_dtype())),
             ("landscape/Phi", np.zeros((2, 8))),
             ("landscape/Phi", np.zeros(9)),
+            ("landscape/Phi", np.zeros((0, 9))),
         ],
     )
     def test_wrong_shapes_types_and_values(self, path, name, value):

@@ -51,9 +51,9 @@ class Comparison:
     Attributes
     ----------
     errors:
-        By name: ``T`` (length of the error of (T1, T2), both 0 at the first frame compared),
+        By name: ``T`` (length of the error of (T1, T2), equal at the first frame compared),
         ``T_offset_removed`` (the same after its mean is taken away), ``phi`` (modulo 2π), ``omega_3``,
-        ``alpha``, ``alpha_relative``, ``R`` (angle, both 1 at the first frame compared), ``R_aligned`` (angle
+        ``alpha``, ``alpha_relative``, ``R`` (angle, equal at the first frame compared), ``R_aligned`` (angle
         after the best constant rotation of the object).
     common, compared:
         Frames in both files (and not trimmed), and those among them that are valid in both.
@@ -72,12 +72,14 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Matched:
-    """A result and its truth on the same frames, units and mirror solution, T = 0 and R = 1 at the first one.
+    """A result and its truth on the same frames, in the same units and gauge.
 
     Attributes
     ----------
-    result, truth:
-        Of the K common frames.
+    result:
+        Its K common frames.
+    truth:
+        The same frames in the result's units and mirror solution, with its T and R at the first usable frame.
     usable:
         ``(K,)`` True where both are valid.
     mirrored, notes:
@@ -147,9 +149,9 @@ def match(result: Motion, truth: Motion, *, trim: int = 0) -> Matched:
     a, b = take(result, in_result[kept]), take(truth, in_truth[kept])
     b, notes = _convert_units(a, b)
     usable = (a.valid > 0) & (b.valid > 0)
-    a, b = _zero(a, b, usable)
     mirrored = _is_mirrored(a, b, usable)
-    return Matched(a, mirror(b) if mirrored else b, usable, mirrored, notes)
+    b = _fix_gauge(a, mirror(b) if mirrored else b, usable)
+    return Matched(a, b, usable, mirrored, notes)
 
 
 def take(motion: Motion, rows: NDArray[np.integer]) -> Motion:
@@ -236,18 +238,17 @@ def _time_factor(result: Motion, truth: Motion) -> float:
     return factor
 
 
-def _zero(a: Motion, b: Motion, usable: NDArray[np.bool_]) -> tuple[Motion, Motion]:
-    """Set T = 0 and R = 1 at the first usable frame of both."""
-    T_known = usable & np.isfinite(a.T + b.T).all(axis=1)
-    if T_known.any():
-        first = int(np.argmax(T_known))
-        a, b = dataclasses.replace(a, T=a.T - a.T[first]), dataclasses.replace(b, T=b.T - b.T[first])
-    R_known = usable & _finite(a.R) & _finite(b.R)
-    if R_known.any():
-        first = int(np.argmax(R_known))
-        a = dataclasses.replace(a, R=a.R[first].T @ a.R)
-        b = dataclasses.replace(b, R=b.R[first].T @ b.R)
-    return a, b
+def _fix_gauge(a: Motion, b: Motion, usable: NDArray[np.bool_]) -> Motion:
+    """Give `b` the T and the R of `a` at the first usable frame."""
+    known = usable & np.isfinite(a.T + b.T).all(axis=1)
+    if known.any():
+        first = int(np.argmax(known))
+        b = dataclasses.replace(b, T=b.T + (a.T[first] - b.T[first]))
+    known = usable & _finite(a.R) & _finite(b.R)
+    if known.any():
+        first = int(np.argmax(known))
+        b = dataclasses.replace(b, R=a.R[first] @ b.R[first].T @ b.R)
+    return b
 
 
 def _is_mirrored(a: Motion, b: Motion, usable: NDArray[np.bool_]) -> bool:

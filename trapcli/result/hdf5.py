@@ -35,6 +35,7 @@ _MAX_BYTES = 2 << 30
 _ROW_BYTES = 8 * 32
 """Memory of one frame, all series together."""
 _MAX_TEXT = 16 << 20
+_END_OF_TIME = 1e100
 _TEXT = h5py.string_dtype()
 _HEAP_SIGNATURE = b"GCOL\x01"
 _HEAP_SIZE = struct.Struct("<Q")
@@ -299,8 +300,8 @@ class _Reader:
             raise self._error("incomplete: its writing was interrupted; estimate again")
 
     def _check_values(self, time: Array, R: Array) -> None:
-        if not np.isfinite(time).all():
-            raise self._error("/motion/time holds values that are no times")
+        if not (np.abs(time) < _END_OF_TIME).all() or not (np.diff(time) > 0).all():
+            raise self._error("/motion/time holds values that are no increasing times")
         known = R[np.isfinite(R).all(axis=(1, 2))]
         with np.errstate(over="ignore", invalid="ignore"):
             orthogonal = np.abs(known.transpose(0, 2, 1) @ known - np.eye(3)) < 1e-6
@@ -309,7 +310,7 @@ class _Reader:
 
     def _landscape(self) -> Landscape:
         shape = self._shape("motion/landscape/Phi")
-        if len(shape) != 2 or shape[0] * shape[1] * 8 > _MAX_BYTES:
+        if len(shape) != 2 or not 0 < shape[0] * shape[1] * 8 <= _MAX_BYTES:
             raise self._error(f"/motion/landscape/Phi has the shape {shape}, which can't be")
         return Landscape(
             phi=self._numbers("motion/landscape/phi", shape[1:]).astype(np.float64),

@@ -1,0 +1,99 @@
+"""``trap-motion plot``: the paper's figures for a result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from trapcli.cli.options import PATH, Console, console_options, overwrite_option, print_path, refuse_input
+
+if TYPE_CHECKING:
+    from trapcli.report.figures import Projection
+    from trapcli.result.motion import Motion
+
+PROJECTIONS = 4
+"""Frames of the stack that are shown where none are chosen."""
+
+
+@click.command()
+@click.argument("result", type=PATH)
+@click.option("-o", "--output", type=PATH, help="Figure: .png, .pdf or .svg.  [default: RESULT.png]")
+@click.option("--truth", type=PATH, help="True motion, drawn over the result.")
+@click.option("--stack", type=PATH, help="The stack itself, to show projections with the tracked centre.")
+@click.option(
+    "--time-step",
+    "steps",
+    type=click.IntRange(min=0),
+    multiple=True,
+    metavar="N",
+    help="Frame whose projection and Phi are shown; may be repeated.",
+)
+@overwrite_option
+@console_options
+def command(
+    result: Path,
+    output: Path | None,
+    truth: Path | None,
+    stack: Path | None,
+    steps: tuple[int, ...],
+    overwrite: bool,
+    console: Console,
+) -> None:
+    """Draw translation, phi, omega_3 and alpha of RESULT on one page.
+
+    With --truth the exact curves and the errors are added, with --stack some projections. The function Phi is
+    shown where RESULT has it (--method paper). The name of the figure goes to stdout.
+    """
+    from trapcli.atomic import atomic_path, check_output
+    from trapcli.errors import ConfigError, InputError
+    from trapcli.report import figures
+    from trapcli.result.motion import Motion
+
+    output = output or result.with_suffix(".png")
+    suffix = output.suffix.lower()
+    if suffix not in figures.FORMATS:
+        raise ConfigError(f"{output}: no known kind of figure; end the name in {', '.join(figures.FORMATS)}")
+    refuse_input(output, result, *filter(None, (truth, stack)))
+    check_output(output, overwrite)
+    motion = Motion.load(result)
+    exact = Motion.load(truth) if truth else None
+    projections = _read_projections(stack, motion, steps) if stack else ()
+    _note_missing(motion, steps, console)
+    try:
+        figure = figures.draw(motion, truth=exact, projections=projections, steps=steps, title=result.name)
+    except InputError as error:
+        raise InputError(f"{result} and {truth}: {error}") from None
+    with atomic_path(output, overwrite) as temporary:
+        figures.save(figure, temporary, suffix)
+    print_path(output)
+
+
+def _read_projections(stack: Path, motion: Motion, steps: Sequence[int]) -> list[Projection]:
+    """Read the chosen frames as the result's own configuration did (region, channel, pixel size)."""
+    import dataclasses
+    import tomllib
+
+    import numpy as np
+
+    from trapcli.config import InputConfig, from_dict
+    from trapcli.report.figures import Projection
+    from trapcli.stack import open_stack
+
+    stored = tomllib.loads(motion.provenance.get("configuration", "")).get("input", {})
+    config = from_dict(InputConfig, stored, "configuration in the result")
+    chosen = steps or motion.frame[np.linspace(0, len(motion) - 1, PROJECTIONS).round().astype(int)].tolist()
+    projections = []
+    for frame in dict.fromkeys(chosen):
+        frames = open_stack(str(stack), dataclasses.replace(config, frames=f"{frame}:{frame + 1}"))
+        size = 1.0 if motion.length_unit == "pixel" else frames.info.pixel_size
+        projections.append(Projection(int(frame), frames.to_array()[0], size))
+    return projections
+
+
+def _note_missing(motion: Motion, steps: Sequence[int], console: Console) -> None:
+    kept = [] if motion.landscape is None else motion.landscape.frame.tolist()
+    if kept and steps and not set(steps) & set(kept):
+        console.note(f"Phi is not stored for these frames, but for {', '.join(map(str, kept))}")
