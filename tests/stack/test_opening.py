@@ -55,6 +55,7 @@ def test_things_that_are_no_files(tmp_path: Path) -> None:
         (".", "no TIFF files"),
         ("missing/stack.tif", "No such file"),
         ("missing.h5::/data", "No such file"),
+        ("x" * 300 + "::/data", "name too long"),
         ("x" * 300, "name too long"),
         ("nul\0byte", "null"),
     ):

@@ -313,7 +313,9 @@ def test_imagej_calibration(tmp_path: Path) -> None:
     assert (info.frame_interval, info.pixel_size, info.pixel_unit) == (0.5, 3.0, "nm")
 
 
-@pytest.mark.parametrize("metadata", [{}, {"unit": "pixel"}, {"finterval": 0.0}, {"finterval": "nan"}])
+@pytest.mark.parametrize(
+    "metadata", [{}, {"unit": "pixel"}, {"unit": "inch"}, {"finterval": 0.0}, {"finterval": "nan"}]
+)
 def test_resolution_for_printing_is_no_calibration(tmp_path: Path, metadata: dict[str, Any]) -> None:
     path = tmp_path / "stack.tif"
     tifffile.imwrite(

@@ -77,7 +77,11 @@ def imagej_calibration(
     seconds = _seconds(metadata.get("finterval"), str(metadata.get("tunit", "s")), warnings)
     unit = _unit(unescape(str(metadata.get("unit", ""))))
     size = None
-    if resolution and unit != "pixel" and (unit or (resolution_unit == 1 and resolution != (1.0, 1.0))):
+    # without a unit, or in inches, ImageJ has passed on what a camera or a program meant for printing
+    known = unit not in ("", "pixel", "inch") or (
+        not unit and resolution_unit == 1 and resolution != (1.0, 1.0)
+    )
+    if resolution and known:
         size = _square(tuple(1 / value if value else 0.0 for value in resolution), warnings)
     return Calibration(seconds, size, (unit or None) if size else None, None, tuple(warnings))
 

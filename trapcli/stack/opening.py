@@ -70,7 +70,7 @@ def open_stack(text: str, config: InputConfig | None = None) -> Frames:
 
 def _open_source(text: str, config: InputConfig) -> Source:
     path = Path(text)
-    if "::" in text and not path.exists():
+    if "::" in text and not os.path.exists(text):
         file, _, dataset = text.rpartition("::")
         return _open_source(file, replace(config, dataset=dataset))
     if sequence.is_pattern(path):
