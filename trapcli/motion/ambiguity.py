@@ -1,7 +1,8 @@
 """From lines to directions: φ as a continuous function of time, in one of the two mirror solutions.
 
-The first-order equation knows the line of direction φ, not which way it points: φ and φ + π solve it alike, which is the
-mirror ambiguity R ↔ ΣRΣ of the paper. Continuity in time leaves one choice for the whole series.
+The first-order equation knows the line of direction φ, not which way it points: φ and φ + π solve it alike,
+which is the mirror ambiguity R ↔ ΣRΣ of the paper. Continuity in time leaves one choice for the whole
+series.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Values and derivatives of the reduced map between its grid angles, spectrally.
 
-On a ring of radius μ the map is a trigonometric polynomial in φ: half a turn of samples is all there is, since
-J̃(−k) is the conjugate of J̃(k). So the real part repeats after π and the imaginary part changes its sign.
+On a ring of radius μ the map is a trigonometric polynomial in φ: half a turn of samples is all there is,
+since J̃(−k) is the conjugate of J̃(k). So the real part repeats after π and the imaginary part changes its
+sign.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class RingErrors:
     share: float = 1.0
 
     def gain(self, order: int) -> Array:
-        """Return ``(M,)`` by how much ∂φ^order raises the noise: white pixel noise in a disc has this spectrum."""
+        """Return ``(M,)`` by how much ∂φ^order raises the noise of pixels in a disc."""
         gain: Array = (self.mu * self.radius) ** order * np.sqrt(_DISC_MOMENTS[order])
         return gain
 
@@ -103,7 +104,7 @@ def on_lines(samples: NDArray[Any], phi: Array, orders: tuple[int, ...]) -> NDAr
 
 
 def on_grid(samples: NDArray[Any], phi: Array, order: int) -> NDArray[np.complex128]:
-    """Return ∂φ^order J̃ of ``(..., L)`` polar samples at the same ``(K,)`` angles in all frames, ``(..., K)``."""
+    """Return ∂φ^order J̃ of ``(..., L)`` polar samples at ``(K,)`` angles, the same in all frames."""
     even, odd = interpolation_weights(phi, samples.shape[-1], (order,))
     value: NDArray[np.complex128] = samples.real @ even[..., 0].T + 1j * (samples.imag @ odd[..., 0].T)
     return value

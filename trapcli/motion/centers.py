@@ -1,8 +1,8 @@
 """Centres C₂ of the frames (``eq:c2``), exact on clean frames and weighted around the object on noisy ones.
 
-One rule serves both: the centroid is taken inside a smooth disc about itself, as wide as the object stands out of
-the noise. Without noise that is the whole frame and the plain centroid; with noise the disc keeps out what is not
-object.
+One rule serves both: the centroid is taken inside a smooth disc about itself, as wide as the object stands
+out of the noise. Without noise that is the whole frame and the plain centroid; with noise the disc keeps
+out what is not object.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def estimate_centers(
 
 
 def sample_frames(frames: Frames, count: int = _SURVEY) -> NDArray[Any]:
-    """Return at most `count` frames spread evenly over the stack, ``(K, H, W)``; those with NaN are left out."""
+    """Return at most `count` frames without NaN, spread evenly over the stack, ``(K, H, W)``."""
     wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
     images = [image for image in pick_frames(frames, wanted) if np.isfinite(image).all()]
     return np.array(images).reshape(-1, *frames.shape[1:])
@@ -133,7 +133,8 @@ def pick_frames(frames: Frames, wanted: NDArray[np.integer[Any]]) -> list[NDArra
 def pixel_noise(images: NDArray[Any]) -> float:
     """Return the standard deviation of white noise in ``(K, H, W)`` images.
 
-    It is read off the corners of their Fourier transforms, beyond the circle that a smooth object keeps inside.
+    It is read off the corners of their Fourier transforms, beyond the circle that a smooth object keeps
+    inside.
     """
     if not len(images) or min(images.shape[1:]) < 4:
         return 0.0
@@ -285,8 +286,8 @@ def _inside(mask: NDArray[np.bool_]) -> slice:
 
 def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the coordinates of columns and rows in pixels from pixel ``(H//2, W//2)``."""
-    height, width = shape
-    return np.arange(width) - float(width // 2), np.arange(height) - float(height // 2)
+    x1, x2 = (np.arange(size, dtype=np.float64) - size // 2 for size in reversed(shape))
+    return x1, x2
 
 
 def _brightest(image: Array) -> Array:
@@ -295,7 +296,8 @@ def _brightest(image: Array) -> Array:
     smooth = cv2.blur(image, (size, size))
     x1, x2 = _axes(image.shape)
     bright = smooth > 0.5 * smooth.max()
-    return np.array([bright.sum(axis=0) @ x1, bright.sum(axis=1) @ x2]) / max(bright.sum(), 1)
+    moments: Array = np.array([bright.sum(axis=0) @ x1, bright.sum(axis=1) @ x2])
+    return moments / max(float(bright.sum()), 1.0)
 
 
 def _lever(shape: tuple[int, ...], radius: float) -> float:

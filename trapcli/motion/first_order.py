@@ -1,8 +1,8 @@
 """Direction φ and height ω₃ of the angular velocity from the first-order equation (``propD1``).
 
-On the polar grid D¹J̃(μv)⟦μv⊥⟧ = ∂φJ̃, so ``eqRecSymmetryFirstOrder`` reads ∂tJ̃ = ω₃ ∂φJ̃ on the line of direction φ. The
-paper's function Φ, by brute force, says which lines come into question; least squares in (φ, ω₃), weighted by the
-noise, finds the best of them between the scanned angles.
+On the polar grid D¹J̃(μv)⟦μv⊥⟧ = ∂φJ̃, so ``eqRecSymmetryFirstOrder`` reads ∂tJ̃ = ω₃ ∂φJ̃ on the line of
+direction φ. The paper's function Φ, by brute force, says which lines come into question; least squares in
+(φ, ω₃), weighted by the noise, finds the best of them between the scanned angles.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class FirstOrder:
     common_height, common_error:
         ``(n,)`` the one ω₃ that suits all lines best, as if α were 0, and its 1-σ error [rad / time].
     excess:
-        ``(n,)`` mean square of what `common_height` leaves on all lines, in units of the noise's: about 1 where
-        nothing speaks for α > 0.
+        ``(n,)`` mean square of what `common_height` leaves on all lines, in units of the noise's: about 1
+        where nothing speaks for α > 0.
     structured:
         ``(n,)`` frames in which ∂φJ̃ stands out, so that a turn about the optical axis would be seen.
     pace:
@@ -184,7 +184,7 @@ def _scan_misfit(slopes: NDArray[Any], rates: NDArray[Any], errors: RingErrors) 
 def _common_height(
     slopes: NDArray[Any], rates: NDArray[Any], errors: RingErrors
 ) -> tuple[Array, Array, Array]:
-    """Return the one ω₃ that suits all lines best, its error, and the mean square of what is left over the noise's."""
+    """Return the one ω₃ that suits all lines best, its error, and the power left over the noise's."""
     weights = _weights(errors, np.zeros(1))[0][:, None]
     energy = np.sum(weights * np.abs(slopes) ** 2, axis=(1, 2))
     height = np.sum(weights * (np.conj(slopes) * rates).real, axis=(1, 2)) / np.maximum(energy, _TINY)

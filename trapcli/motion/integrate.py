@@ -15,7 +15,7 @@ _BRIDGED = 0.5  # error of an interpolated ω in units of ω
 
 
 def integrate_rotation(omega: Array, time: Array, *, bridge: int = 0) -> Array:
-    """Integrate R(t) on SO(3), from 1 at the first frame, by a Magnus step of fourth order from frame to frame.
+    """Integrate R(t) on SO(3) from R = 1 at the first frame, by Magnus steps of fourth order.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def integrate_rotation(omega: Array, time: Array, *, bridge: int = 0) -> Array:
     R = np.full((n, 3, 3), np.nan)
     if n:
         R[0] = np.eye(3)
-    reach = _reach(np.isfinite(omega).all(axis=1), bridge)
+    reach = _reach(_known(omega), bridge)
     if reach < 2:
         return R
     filled = _filled(omega[:reach], time[:reach])
@@ -74,7 +74,7 @@ def rotation_errors(omega: Array, covariance: Array, time: Array, correlation: f
     """
     n = len(time)
     errors = np.full((n, 3), np.nan)
-    known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(omega).all(axis=1)
+    known = _known(covariance) & _known(omega)
     if not known.any():
         return errors
     if n:
@@ -93,6 +93,10 @@ def rotation_errors(omega: Array, covariance: Array, time: Array, correlation: f
     return errors
 
 
+def _known(series: Array) -> NDArray[np.bool_]:
+    return np.array([np.isfinite(entry).all() for entry in series], bool)
+
+
 def _reach(known: NDArray[np.bool_], bridge: int) -> int:
     """Return how many frames can be integrated before a gap longer than `bridge`."""
     found = np.flatnonzero(known)
@@ -108,5 +112,5 @@ def _reach(known: NDArray[np.bool_], bridge: int) -> int:
 
 def _filled(series: Array, time: Array) -> Array:
     """Interpolate unknown frames linearly; the ends are continued by the nearest known frame."""
-    known = np.isfinite(series).all(axis=1)
+    known = _known(series)
     return np.stack([np.interp(time, time[known], column[known]) for column in series.T], axis=1)

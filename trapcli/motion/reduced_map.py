@@ -1,8 +1,8 @@
-"""The reduced attenuation map J̃ (``eqRecMapReduced``): each frame's Fourier transform about its centre, on lines.
+"""The reduced attenuation map J̃ (``eqRecMapReduced``): Fourier transforms of the frames about their centres.
 
-Everything after this needs J̃ on lines through the origin only, so it is sampled once on a polar grid and the frames are
-not needed again. What is sampled follows from the data: the frames are cropped to the object, the band ends where the
-spectrum meets the noise, and pixels finer than the band needs are binned.
+Everything after this needs J̃ on lines through the origin only, so it is sampled once on a polar grid and
+the frames are not needed again. What is sampled follows from the data: the frames are cropped to the
+object, the band ends where the spectrum meets the noise, and pixels finer than the band needs are binned.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _BATCH = 32  # frames per transform
 
 @dataclass(frozen=True)
 class _Grid:
-    """How frames become polar samples: crop and bin [pixels], mask radius [pixels], polar grid and precision."""
+    """How frames become polar samples: crop, bin and disc in pixels, polar grid, precision."""
 
     crop: tuple[int, int]
     binning: int
@@ -60,7 +60,7 @@ def reduce_frames(
     band: float = 0.0,
     progress: Progress | None = None,
 ) -> ReducedMap:
-    """Sample the reduced attenuation map of all frames (``eqRecMapReduced``; Elbau et al. 2020, Inverse Problems 36).
+    """Sample the reduced attenuation map of all frames (``eqRecMapReduced``; Elbau et al. 2020).
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class _PolarTransform:
         # what averaging over a cell has taken from each frequency, and the measure of the integral
         self._factor = cell**2 / (2 * np.pi) / (_cell_mean(self._k1, grid) * _cell_mean(self._k2, grid))
         self._points = [
-            (k * cell).ravel().astype(self.dtype.type(0).real.dtype) for k in (self._k2, self._k1)
+            (k * cell).ravel().astype(np.float32 if grid.single else np.float64) for k in (self._k2, self._k1)
         ]
         self._plans: dict[int, Any] = {}
 
@@ -133,7 +133,7 @@ class _PolarTransform:
         return float(np.linalg.norm(weights)) * self.grid.pixel_size**2 / (2 * np.pi)
 
     def __call__(self, images: NDArray[Any], centers: Array, level: Array) -> NDArray[Any]:
-        """Return ``(n, M, L)`` samples of ``(n, H, W)`` frames with ``(n, 2)`` centres [length] above ``(n,)`` levels."""
+        """Return ``(n, M, L)`` samples of ``(n, H, W)`` frames with their centres [length] and levels."""
         grid, (rows, columns) = self.grid, self._cells
         b = grid.binning
         cropped = np.zeros((len(images), rows * b, columns * b))
@@ -170,7 +170,7 @@ def _cell_mean(k: Array, grid: _Grid) -> Array:
 
 
 def _cut(image: NDArray[Any], center: Array, level: float, grid: _Grid, target: Array) -> Array:
-    """Copy the weighted attenuation around the object into `target`; return where its middle cell lies [pixels]."""
+    """Copy the weighted surroundings of the object into `target`; return the place of its middle cell."""
     height, width = image.shape
     origin = np.array([width // 2, height // 2])
     size = np.array([grid.crop[1], grid.crop[0]])
@@ -213,7 +213,7 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
 def _rings(band: float, radius: float) -> Array:
     """Return radii spaced so that an object of `radius` is just resolved along a line."""
     step = np.pi / (MARGIN * radius)
-    return step * np.arange(1, max(4, int(np.ceil(band / step))) + 1)
+    return step * np.arange(1, max(4, int(np.ceil(band / step))) + 1, dtype=np.float64)
 
 
 def _angles(count: int) -> Array:

@@ -1,12 +1,13 @@
 """Cylindrical radius α of the angular velocity from the third-order equation (``propD3``).
 
-The printed equation ``eq:RecSymmetryThirdOrder``, A₀ + A₀₂ α² + A₁ μ α'/α = 0, needs tensors of derivatives in k. In polar
-coordinates, with D¹⟦μv⊥⟧ = ∂φJ̃, μ²D²⟦v⊥,v⊥⟧ = ∂φφJ̃ + μ∂μJ̃, D²⟦v,v⊥⟧ = ∂μ(∂φJ̃/μ) and
-μ³D³⟦v⊥,v⊥,v⊥⟧ = ∂φφφJ̃ + 3μ ∂μφJ̃ − 2∂φJ̃, the radial derivatives in A₁ cancel, and those in A₀ add up to a multiple of
-∂μ(∂tJ̃ − ω₃∂φJ̃), which the first-order equation makes vanish on the line. What is left, divided by the common factor
-(ω₃ + σ)/2, is
+The printed equation ``eq:RecSymmetryThirdOrder``, A₀ + A₀₂ α² + A₁ μ α'/α = 0, needs tensors of derivatives
+in k. In polar coordinates, with D¹⟦μv⊥⟧ = ∂φJ̃, μ²D²⟦v⊥,v⊥⟧ = ∂φφJ̃ + μ∂μJ̃, D²⟦v,v⊥⟧ = ∂μ(∂φJ̃/μ) and
+μ³D³⟦v⊥,v⊥,v⊥⟧ = ∂φφφJ̃ + 3μ ∂μφJ̃ − 2∂φJ̃, the radial derivatives in A₁ cancel, and those in A₀ add up to a
+multiple of ∂μ(∂tJ̃ − ω₃∂φJ̃), which the first-order equation makes vanish on the line. What is left,
+divided by the common factor (ω₃ + σ)/2, is
 
-    ∂ttφJ̃ − ω₃' ∂φφJ̃ − (3ω₃ − σ)/2 ∂tφφJ̃ + ω₃(ω₃ − σ)/2 ∂φφφJ̃  +  α² ∂φJ̃  −  (α'/α) (∂tφJ̃ − ω₃ ∂φφJ̃)  =  0
+    ∂ttφJ̃ − ω₃' ∂φφJ̃ − (3ω₃ − σ)/2 ∂tφφJ̃ + ω₃(ω₃ − σ)/2 ∂φφφJ̃  +  α² ∂φJ̃  −  (α'/α) (∂tφJ̃ − ω₃ ∂φφJ̃)
+    =  0
 
 for all μ: a linear system for α² and α'/α that takes no derivative along the line.
 """
@@ -53,12 +54,14 @@ class LineDerivatives:
         values = on_lines(value, phi[:, None], (1, 2, 3))[:, 0]
         rates = on_lines(rate, phi[:, None], (1, 2))[:, 0]
         accelerations = on_lines(acceleration, phi[:, None], (1,))[:, 0]
-        return cls(*np.moveaxis(values, -1, 0), *np.moveaxis(rates, -1, 0), accelerations[..., 0])
-
-    @classmethod
-    def joined(cls, parts: list[LineDerivatives]) -> LineDerivatives:
-        """Join the frames of several."""
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__annotations__))
+        return cls(
+            slope=values[..., 0],
+            curvature=values[..., 1],
+            third=values[..., 2],
+            rate_slope=rates[..., 0],
+            rate_curvature=rates[..., 1],
+            acceleration_slope=accelerations[..., 0],
+        )
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,7 @@ def solve(
 
 def _per_sigma(line: LineDerivatives, omega_3: Array) -> NDArray[Any]:
     """Return the derivative of the constant term with respect to σ."""
-    return (line.rate_curvature - omega_3[:, None] * line.third) / 2
+    return np.asarray(line.rate_curvature - omega_3[:, None] * line.third) / 2
 
 
 def _weights(errors: RingErrors, omega_3: Array, sigma: Array, omega_3_rate: Array) -> Array:

@@ -1,9 +1,9 @@
 """Time derivatives of noisy series by local polynomials, with windows chosen from the data.
 
-A derivative at a frame is that of the least-squares polynomial through a window of frames around it (Savitzky and
-Golay). Short windows of high degree are finite differences and suit exact data; long windows suit noisy data. Which
-one is best is measured: the variance follows from the noise and the weights, the squared bias from what a polynomial of
-higher degree sees differently in the same window.
+A derivative at a frame is that of the least-squares polynomial through a window of frames around it
+(Savitzky and Golay). Short windows of high degree are finite differences and suit exact data; long windows
+suit noisy data. Which one is best is measured: the variance follows from the noise and the weights, the
+squared bias from what a polynomial of higher degree sees differently in the same window.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def choose_filters(
         Ends get windows of their own, judged by how such one-sided windows do elsewhere in the series.
     """
     noise = difference_noise(series) if noise is None else noise
-    trial = _Trial(series, noise, _unit_kernel(correlation), width)
+    trial = _Trial(series, noise, _unit_kernel(correlation), width and width | 1)
     filters = []
     for order in orders:
         central, error = trial.best(order, len(series))
@@ -191,8 +191,8 @@ def choose_filters(
 def difference_noise(series: NDArray[Any]) -> float:
     """Return the standard deviation of the white noise in an ``(n, K)`` series, from its differences in time.
 
-    A signal that is smooth in time cancels in differences of high order while white noise does not; whatever order
-    leaves least (at unit gain for white noise) is nearest to the noise alone.
+    A signal that is smooth in time cancels in differences of high order while white noise does not;
+    whatever order leaves least (at unit gain for white noise) is nearest to the noise alone.
     """
     least = np.inf
     difference = series
@@ -211,7 +211,7 @@ class _Trial:
 
     series: NDArray[Any]
     noise: float
-    kernel: Array
+    kernel: Array | None
     fixed_width: int
     _cut: dict[int, NDArray[Any]] = field(default_factory=dict)
 
@@ -246,7 +246,8 @@ class _Trial:
     def _mean_squares(self, filters: list[Array], one_sided: bool) -> list[float]:
         """Return the mean square of what each filter gives; infinite for filters longer than the series.
 
-        One-sided filters are needed at the ends, forwards and backwards: what they give there counts if it is more.
+        One-sided filters are needed at the ends, forwards and backwards: what they give there counts if it
+        is more.
         """
         powers = [np.inf] * len(filters)
         for length in {len(f) for f in filters if len(f) <= len(self.series)}:
@@ -275,7 +276,7 @@ class _Trial:
 
 
 def _against_higher_degree(weights: Array, before: int, higher: int, order: int) -> Array:
-    """Return the weights of the difference between a higher degree, in a wider window if it needs one, and `weights`."""
+    """Return the weights of a higher degree, in a wider window if it needs one, less `weights`."""
     width = len(weights)
     wider = max(width, higher + 1)
     start = -before
@@ -314,7 +315,7 @@ def _gain(weights: Array, kernel: Array | None) -> float:
 
 @lru_cache(maxsize=8192)
 def _weights(start: int, width: int, degree: int, order: int) -> Array:
-    """Return what `fit_weights` does for a window without gaps, from a factorisation that windows of a width share."""
+    """Return what `fit_weights` does for a window without gaps; windows of a width share a factorisation."""
     q, r = _orthogonal(width, degree)
     weights: Array = q @ np.linalg.solve(r.T, _derivative_at_zero(start, start + width - 1, degree, order))
     weights.flags.writeable = False

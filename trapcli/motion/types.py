@@ -16,7 +16,8 @@ class ReducedMap:
     """Reduced attenuation map J̃ on a polar grid (``eqRecMapReduced``).
 
     ``samples[n, i, j] = F₂[J](t_n, μ_i v(φ_j)) · exp(i⟨μ_i v(φ_j), C₂(t_n)⟩)`` with
-    ``F₂[f](k) = (2π)⁻¹ ∫ f(x) exp(−i⟨k, x⟩) dx``; J̃(−k) is the complex conjugate of J̃(k), so half a turn of φ is all.
+    ``F₂[f](k) = (2π)⁻¹ ∫ f(x) exp(−i⟨k, x⟩) dx``; J̃(−k) is the complex conjugate of J̃(k), so half a
+    turn of φ is all.
 
     Attributes
     ----------
