@@ -22,7 +22,9 @@ PROJECTIONS = 4
 @click.argument("result", type=PATH)
 @click.option("-o", "--output", type=PATH, help="Figure: .png, .pdf or .svg.  [default: RESULT.png]")
 @click.option("--truth", type=PATH, help="True motion, drawn over the result.")
-@click.option("--stack", type=PATH, help="The stack itself, to show projections with the tracked centre.")
+@click.option(
+    "--stack", metavar="INPUT", help="The stack itself, to show projections with the tracked centre."
+)
 @click.option(
     "--time-step",
     "steps",
@@ -37,7 +39,7 @@ def command(
     result: Path,
     output: Path | None,
     truth: Path | None,
-    stack: Path | None,
+    stack: str | None,
     steps: tuple[int, ...],
     overwrite: bool,
     console: Console,
@@ -56,7 +58,7 @@ def command(
     suffix = output.suffix.lower()
     if suffix not in figures.FORMATS:
         raise ConfigError(f"{output}: no known kind of figure; end the name in {', '.join(figures.FORMATS)}")
-    refuse_input(output, result, *filter(None, (truth, stack)))
+    refuse_input(output, result, *(Path(path) for path in (truth, stack) if path))
     check_output(output, overwrite)
     motion = Motion.load(result)
     exact = Motion.load(truth) if truth else None
@@ -71,7 +73,7 @@ def command(
     print_path(output)
 
 
-def _read_projections(stack: Path, motion: Motion, steps: Sequence[int]) -> list[Projection]:
+def _read_projections(stack: str, motion: Motion, steps: Sequence[int]) -> list[Projection]:
     """Read the chosen frames as the result's own configuration did (region, channel, pixel size)."""
     import dataclasses
     import tomllib
@@ -79,6 +81,7 @@ def _read_projections(stack: Path, motion: Motion, steps: Sequence[int]) -> list
     import numpy as np
 
     from trapcli.config import InputConfig, from_dict
+    from trapcli.errors import InputError
     from trapcli.report.figures import Projection
     from trapcli.stack import open_stack
 
@@ -87,7 +90,10 @@ def _read_projections(stack: Path, motion: Motion, steps: Sequence[int]) -> list
     chosen = steps or motion.frame[np.linspace(0, len(motion) - 1, PROJECTIONS).round().astype(int)].tolist()
     projections = []
     for frame in dict.fromkeys(chosen):
-        frames = open_stack(str(stack), dataclasses.replace(config, frames=f"{frame}:{frame + 1}"))
+        try:
+            frames = open_stack(stack, dataclasses.replace(config, frames=f"{frame}:{frame + 1}"))
+        except InputError as error:
+            raise InputError(f"frame {frame} can't be shown: {error}") from None
         size = 1.0 if motion.length_unit == "pixel" else frames.info.pixel_size
         projections.append(Projection(int(frame), frames.to_array()[0], size))
     return projections

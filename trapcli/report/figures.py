@@ -356,11 +356,15 @@ def _shade_invalid(axes: Axes, shown: Motion) -> None:
 
 
 def _finish(axes: Axes, shown: Motion, unit: str, values: Array, true: Array | None) -> None:
-    """Label the axes; show all trusted and true values and most of the others, whatever the bands do."""
-    trusted, others = values[shown.valid > 0], values[shown.valid == 0]
-    others = others[np.isfinite(others)]
-    most = np.quantile(others, [0.02, 0.98]) if len(others) else others
-    seen = np.concatenate([trusted.ravel(), most, true.ravel() if true is not None else others[:0]])
+    """Label the axes; show all trusted and true values, and the others but for outliers."""
+    known = values[np.isfinite(values)]
+    if len(known):
+        # Tukey's fences
+        first, third = np.quantile(known, [0.25, 0.75])
+        known = known[np.abs(known - (first + third) / 2) <= 2 * (third - first)]
+    seen = np.concatenate(
+        [values[shown.valid > 0].ravel(), known, np.empty(0) if true is None else true.ravel()]
+    )
     seen = seen[np.isfinite(seen)]
     if len(seen):
         low, high = float(seen.min()), float(seen.max())
