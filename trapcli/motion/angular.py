@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-# even moments of one coordinate over a disc of unit radius: mean of x^0, x^2, x^4, x^6
-_DISC_MOMENTS = (1.0, 1 / 4, 1 / 8, 5 / 64)
+# mean of |∂φ^q exp(−i⟨k, x⟩)|² over a disc, for q = 0 … 3, as polynomials in (|k| · radius)²
+_DISC_POWERS = ((1.0,), (0.0, 1 / 4), (0.0, 1 / 4, 1 / 8), (0.0, 1 / 4, 5 / 8, 5 / 64))
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class RingErrors:
 
     def gain(self, order: int) -> Array:
         """Return ``(M,)`` by how much ∂φ^order raises the noise of pixels in a disc."""
-        gain: Array = (self.mu * self.radius) ** order * np.sqrt(_DISC_MOMENTS[order])
-        return gain
+        power = np.polynomial.polynomial.polyval((self.mu * self.radius) ** 2, np.array(_DISC_POWERS[order]))
+        return np.asarray(np.sqrt(power))
 
 
 def interpolation_weights(phi: Array, size: int, orders: tuple[int, ...]) -> tuple[Array, Array]:

@@ -27,6 +27,7 @@ TAPER = 1.2
 _SURVEY = 32  # frames that the noise and the radius are measured on
 _RING = 2.0  # width of the rings of the radial profile [pixels]
 _VISIBLE = 0.06  # least power of a ring that counts as object, in units of the noise's
+_PLATEAU = 0.2  # power of the empty field beyond the noise's, in its units, that may be a misjudged noise
 _SIGNIFICANT = 5.0  # standard deviations
 _BLANK = 0.02  # share of the median mass below which a frame holds no object
 _CLIPPED = 0.01  # mean attenuation on one side of the frame, as a share of the frame's highest
@@ -163,8 +164,10 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
     for _ in range(3):
         profiles = [_radial_profile(image, noise, radius) for image in images]
         pixels, power = np.sum(profiles, axis=0) if profiles else np.zeros((2, 1))
-        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1)))
-        seen = np.flatnonzero(power > least * noise**2 * pixels)
+        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1))) * noise**2
+        # a noise that is a few percent off must not pass for an object as wide as the frame
+        least += np.clip(np.median(power / np.maximum(pixels, 1)), 0, _PLATEAU * noise**2)
+        seen = np.flatnonzero(power > least * pixels)
         if not len(seen):
             return farthest
         radius = min(_RING * (seen[-1] + 1.0), farthest)

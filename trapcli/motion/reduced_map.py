@@ -35,6 +35,7 @@ _ABOVE_NOISE = 0.05  # power beyond the noise's that still counts once many fram
 _SINGLE_PRECISION = (
     1e-5  # noise, as a share of the highest sample, that leaves nothing for double precision to keep
 )
+_ALIAS = 0.3  # amplitude of an alias in units of the noise
 _BATCH = 32  # frames per transform
 
 
@@ -206,8 +207,22 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     mu = _rings(min(band, 0.9 * np.pi / pixel_size), centers.radius)
     highest = float(np.abs(survey).max())
     lines = _lines(survey[:, whole.mu <= mu[-1]], max(0.01 * noise, 1e-15 * highest))
-    binning = max(1, int(np.pi / pixel_size / (2 * mu[-1])))
+    binning = _binning(survey, whole.mu, mu[-1], noise, pixel_size)
     return _Grid(crop, binning, radius, pixel_size, mu, _angles(lines), noise > _SINGLE_PRECISION * highest)
+
+
+def _binning(survey: NDArray[Any], mu: Array, band: float, noise: float, pixel_size: float) -> int:
+    """Return the coarsest binning whose aliases stay below the noise."""
+    amplitude = np.sqrt(np.maximum(np.mean(np.abs(survey) ** 2, axis=(0, 2)) - noise**2, 0.0))
+    # what is below the noise of the survey may still be there
+    envelope = np.maximum.accumulate(amplitude[::-1])[::-1] + _ALIAS * noise
+    for b in range(int(np.pi / pixel_size / (2 * band)), 1, -1):
+        alias = 2 * np.pi / (b * pixel_size) - band
+        # averaging over a cell damps the alias by its share of the band
+        leak = float(np.interp(alias, mu, envelope, right=envelope[-1])) * band / alias
+        if leak < _ALIAS * noise:
+            return b
+    return 1
 
 
 def _rings(band: float, radius: float) -> Array:

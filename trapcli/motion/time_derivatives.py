@@ -196,7 +196,7 @@ def difference_noise(series: NDArray[Any]) -> float:
     """
     least = np.inf
     difference = series
-    for order in range(2, 11, 2):
+    for order in range(2, 21, 2):
         difference = np.diff(difference, 2, axis=0)
         power = np.mean(np.abs(difference) ** 2, axis=1) / comb(2 * order, order)
         power = power[np.isfinite(power)]
