@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -59,9 +62,6 @@ def test_json_is_strict(capsys):
 
 
 def test_text_that_stdout_cannot_show(monkeypatch, capsys):
-    import io
-    import sys
-
     stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr(sys, "stdout", stdout)
     print_text("12 µm")
@@ -76,3 +76,12 @@ def test_output_that_is_an_input(tmp_path):
     refuse_input(tmp_path / "new", path)
     with pytest.raises(OutputError, match="link: is an input"):
         refuse_input(tmp_path / "link", path)
+
+
+def test_commands_load_without_numpy():
+    """``--help`` must answer at once."""
+    names = ("compare", "export", "plot", "options")
+    imports = "; ".join(f"import trapcli.cli.{name}" for name in names)
+    subprocess.run(
+        [sys.executable, "-c", f"{imports}; import sys; assert 'numpy' not in sys.modules"], check=True
+    )

@@ -123,7 +123,7 @@ def _image(motion: Motion) -> bytes:
         rate = f"rad/{motion.time_unit}"
         time = _put(entry, "time", motion.time, motion.time_unit, "time")
         time.attrs["target"] = "/motion/time"
-        _put(entry, "frame", motion.frame, "frame", "index in the input")
+        _put(entry, "frame", motion.frame.astype(np.int64), "frame", "index in the input")
 
         group = _data(entry, "translation", ("T1", "T2"))
         for i in (0, 1):
@@ -163,8 +163,8 @@ def _put_quality(entry: h5py.Group, motion: Motion) -> None:
     group = _data(entry, "quality", ("residual",))
     group.attrs["identifiable"] = np.bool_(motion.identifiable)
     group.attrs["verdict"] = _clean(motion.verdict)
-    _put(group, "valid", motion.valid, "1")
-    flags = _put(group, "flags", motion.flags, "1")
+    _put(group, "valid", motion.valid.astype(np.uint8), "1")
+    flags = _put(group, "flags", motion.flags.astype(np.uint16), "1")
     flags.attrs["meanings"] = "; ".join(f"{int(flag)}: {meaning}" for flag, meaning in FLAG_MEANINGS.items())
     _put(group, "residual", motion.residual, "1", "relative misfit")
 
@@ -175,7 +175,7 @@ def _put_landscape(entry: h5py.Group, landscape: Landscape) -> None:
     # "spectrum" asks viewers for one curve a frame in place of an image
     _put(group, "Phi", landscape.values, "1", "Φ").attrs["interpretation"] = "spectrum"
     _put(group, "phi", landscape.phi, "rad", "φ")
-    _put(group, "frame", landscape.frame, "frame", "index in the input")
+    _put(group, "frame", landscape.frame.astype(np.int64), "frame", "index in the input")
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str) -> h5py.Group:
