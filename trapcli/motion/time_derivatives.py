@@ -30,6 +30,7 @@ MAX_DEGREE = 10
 
 _SAMPLES = 512  # windows, over all series and places, on which the bias is measured
 _BIAS_DECIDES = 4.0  # squared bias over variance beyond which a degree is not tried with wider windows
+_WIDENED = 1.5  # how far a window may widen to make up for missing frames
 _BLOCK = 64  # frames per matrix product
 
 
@@ -80,6 +81,7 @@ class TimeFilter:
         frames:
             Frames to yield (default: all).
         """
+        known = np.arange(n) if valid is None else np.flatnonzero(valid)
         for frame in range(n) if frames is None else frames:
             window = self.window(min(frame, n - 1 - frame))
             width = min(window.width, n)
@@ -90,7 +92,7 @@ class TimeFilter:
             elif valid is None or valid[start : start + width].all():
                 yield start, _weights(start - frame, width, degree, self.order)
             else:
-                yield start, _gapped_weights(start - frame, valid[start : start + width], degree, self.order)
+                yield _gapped_weights(frame, known, width, degree, self.order)
 
     def apply(
         self,
@@ -344,14 +346,19 @@ def _interval(first: int, last: int) -> tuple[float, float]:
     return (last + first) / 2, max((last - first) / 2, 1.0)
 
 
-def _gapped_weights(start: int, valid: NDArray[np.bool_], degree: int, order: int) -> Array:
-    """Return the weights of a window of which some frames are missing; none where too few are left."""
-    offsets = start + np.flatnonzero(valid)
-    if len(offsets) <= max(degree, len(valid) // 2) or not valid[-start]:
-        return np.empty(0)
-    weights = np.zeros(len(valid))
-    weights[valid] = fit_weights(offsets, degree, order)
-    return weights
+def _gapped_weights(
+    frame: int, known: NDArray[np.intp], width: int, degree: int, order: int
+) -> tuple[int, Array]:
+    """Return start and weights of a window of the `width` known frames around `frame`."""
+    place = int(np.searchsorted(known, frame))
+    first = min(max(place - width // 2, 0), max(len(known) - width, 0))
+    chosen = known[first : first + width]
+    found = place < len(known) and known[place] == frame
+    if not found or len(chosen) <= degree or chosen[-1] - chosen[0] > _WIDENED * width:
+        return frame, np.empty(0)
+    weights = np.zeros(chosen[-1] - chosen[0] + 1)
+    weights[chosen - chosen[0]] = fit_weights(chosen - frame, degree, order)
+    return int(chosen[0]), weights
 
 
 def fit_weights(offsets: NDArray[np.int64], degree: int, order: int) -> Array:
