@@ -23,7 +23,9 @@ Index = NDArray[np.intp]
 
 _PAIRS = 12  # pairs of frames a frame
 _DISTINCT = np.deg2rad(3.0)  # mean angle between paths that are hypotheses of their own
-_GROWTH = 1.5
+_REACH = 10  # groups added at each end at a time
+_SHORT = 120  # groups up to which every refinement takes the whole path
+_GROWTH = 1.4  # growth of a longer path after which the whole is refined again
 _LARGEST_STEP = 0.4  # radians
 _FASTEST = np.deg2rad(160.0)  # turn over the first window
 _SLOWEST = np.deg2rad(10.0)
@@ -151,23 +153,47 @@ def find_branches(
     low = int(middle * (groups - window))
     high = low + window
     hypotheses = _first_window(evidence.select(low, high), starts, keep)
+    refined = high - low
     while high - low < groups:
         if progress is not None:
             progress("branches", high - low, groups)
-        length = min(groups, int(_GROWTH * (high - low)) + 1)
-        new_low = min(max(0, low - (length - (high - low) + 1) // 2), groups - length)
-        new_high = new_low + length
+        new_low, new_high = max(0, low - _REACH), min(groups, high + _REACH)
         wider = evidence.select(new_low, new_high)
-        spline = Spline(wider.time[0], wider.time[-1], max(2, round(length / groups_per_knot)))
+        length = new_high - new_low
+        whole = length < _SHORT or length >= _GROWTH * refined or length == groups
         tail = min(_TAIL, high - low - 1)
-        grown = [
-            wider.refine(h.path.extended(wider.time, low - new_low, tail), spline, 15) for h in hypotheses
-        ]
+        grown = []
+        for h in hypotheses:
+            path = h.path.extended(wider.time, low - new_low, tail)
+            if whole:
+                grown.append(wider.refine(path, _spline(wider.time, groups_per_knot), 12))
+            else:
+                grown.append(wider.judge(_refine_ends(wider, path, groups_per_knot)))
         hypotheses = _distinct(grown, keep)
         low, high = new_low, new_high
+        refined = length if whole else refined
     if progress is not None:
         progress("branches", groups, groups)
     return hypotheses
+
+
+def _spline(time: Array, groups_per_knot: int) -> Spline:
+    return Spline(time[0], time[-1], max(2, round(len(time) / groups_per_knot)))
+
+
+def _refine_ends(evidence: Evidence, path: Path, groups_per_knot: int) -> Path:
+    """Refine both ends of a long path on their own; the middle stays."""
+    groups, size = len(path.time), _SHORT // 2
+    for window, joint in ((slice(0, size), size - 1), (slice(groups - size, groups), 0)):
+        end = evidence.select(window.start, window.stop)
+        piece = Path(path.time[window], path.R[window], path.omega[window])
+        bent = end.refine(piece, _spline(end.time, groups_per_knot), 8).path
+        R, omega = path.R.copy(), path.omega.copy()
+        # the object's orientation is free in each refinement: join where the window meets the rest
+        R[window] = (path.R[window][joint] @ bent.R[joint].T) @ bent.R
+        omega[window] = bent.omega
+        path = Path(path.time, R, omega)
+    return path
 
 
 def _first_window(evidence: Evidence, starts: int, keep: int) -> list[Hypothesis]:
