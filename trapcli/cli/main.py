@@ -10,9 +10,11 @@ from typing import Any
 
 import click
 
-from trapcli.errors import TrapError
+from trapcli.cli.options import say
+from trapcli.errors import ConfigError, OutputError, TrapError
 
 COMMANDS = ("simulate", "estimate", "compare", "plot", "export", "info")
+FAULT = 1
 INTERRUPTED = 130
 
 
@@ -43,27 +45,38 @@ def run(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     try:
         code: Any = cli.main(args=arguments, prog_name="trap-motion", standalone_mode=False)
-        sys.stdout.flush()
+        if sys.stdout:
+            sys.stdout.flush()
     except click.ClickException as error:
-        error.show()
-        code = 2
+        _show_usage(error)
+        code = ConfigError.exit_code
     except (click.Abort, KeyboardInterrupt):
-        _say("interrupted")
+        say("interrupted")
         code = INTERRUPTED
     except TrapError as error:
-        _say(str(error))
+        say(str(error))
         code = error.exit_code
-    except BrokenPipeError:
-        # the reader (for example `head`) has what it wanted
+    except OSError as error:
+        # of stdout, since those of files are a TrapError; a reader like `head` may have what it wanted
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
+        if not isinstance(error, BrokenPipeError):
+            say(f"standard output: can't be written ({error.strerror or error})")
+            code = OutputError.exit_code
+    except Exception as error:
+        say(f"unexpected fault ({type(error).__name__}: {error}); please report it with what -vv shows")
+        code = FAULT
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _show_usage(error: click.ClickException) -> None:
+    if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):
+        error.show()
+        return
+    context = getattr(error, "ctx", None)
+    hint = f"; see {context.command_path} --help" if context else ""
+    say(error.format_message().rstrip(".") + hint)
 
 
 def _terminate(_signal: int, _frame: object) -> None:
     raise KeyboardInterrupt
-
-
-def _say(message: str) -> None:
-    one_line = " ".join(message.split())
-    click.echo(f"trap-motion: {one_line}", err=True)

@@ -11,6 +11,7 @@ import math
 import os
 import shlex
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,6 +39,11 @@ config_option = click.option(
 )
 
 
+def say(message: str) -> None:
+    """Say one line on stderr."""
+    click.echo(f"trap-motion: {' '.join(message.split())}", err=True)
+
+
 @dataclass(frozen=True)
 class Console:
     """Everything that goes to stderr: −1 is quiet, 0 normal, 1 and more verbose."""
@@ -51,7 +57,11 @@ class Console:
     def note(self, message: str) -> None:
         """Say one line; silent when quiet."""
         if self.verbosity >= 0:
-            click.echo(f"trap-motion: {' '.join(message.split())}", err=True)
+            self.error(message)
+
+    def error(self, message: str) -> None:
+        """Say one line, also when quiet."""
+        say(message)
 
     def detail(self, message: str) -> None:
         """Say one line when verbose."""
@@ -84,7 +94,12 @@ def console_options(command: Function) -> Function:
     @click.option("-v", "--verbose", count=True, help="Say more; -vv also shows where an error arose.")
     @functools.wraps(command)
     def wrapper(*args: Any, quiet: bool, verbose: int, **kwargs: Any) -> Any:
-        return command(*args, console=Console(-1 if quiet else verbose), **kwargs)
+        try:
+            return command(*args, console=Console(-1 if quiet else verbose), **kwargs)
+        except Exception:
+            if verbose > 1:
+                traceback.print_exc()
+            raise
 
     return wrapper  # type: ignore[return-value]
 

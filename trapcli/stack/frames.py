@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ class StackInfo:
         True where the codec has changed the pixel values.
     warnings:
         What the user should know before trusting these frames, one sentence each.
+    files:
+        The files the frames come from; a folder stands for all that is in it.
     """
 
     source: str = "array"
@@ -41,6 +44,7 @@ class StackInfo:
     bits: int | None = None
     lossy: bool = False
     warnings: tuple[str, ...] = ()
+    files: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

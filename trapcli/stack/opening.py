@@ -91,7 +91,8 @@ def _open_folder(path: Path, name: str, config: InputConfig) -> Source:
     from trapcli.stack import dataset
 
     if dataset.is_zarr(path):
-        return dataset.open_zarr(path, name, config)
+        source = dataset.open_zarr(path, name, config)
+        return replace(source, info=replace(source.info, files=(path,)))
     return sequence.open_sequence(sequence.in_folder(path), name, config, _open_file)
 
 
@@ -99,7 +100,12 @@ def _open_file(path: Path, name: str, config: InputConfig) -> Source:
     """Open a file by what is in it; its ending says nothing."""
     if not path.is_file():
         raise InputError(f"{name}: is no regular file")
-    path = path.absolute()  # passes to come may find another working folder
+    # passes to come may find another working folder
+    source = _open_content(path.absolute(), name, config)
+    return replace(source, info=replace(source.info, files=(path, *source.info.files)))
+
+
+def _open_content(path: Path, name: str, config: InputConfig) -> Source:
     with guard(name), path.open("rb") as file:
         start = file.read(16)
     if not start:

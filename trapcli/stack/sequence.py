@@ -70,6 +70,7 @@ def open_sequence(files: list[Path], name: str, config: InputConfig, open_file: 
         source=f"{name} ({len(files)} files)",
         format=f"{first.info.format}, {len(files)} files",
         warnings=(*_gaps(files), *warnings),
+        files=tuple(file for source in sources for file in source.info.files),
     )
     return Source(name, (int(ends[-1]), *first.shape[1:]), first.dtype, first.channels, info, read)
 

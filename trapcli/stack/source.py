@@ -122,7 +122,7 @@ def select(source: Source, config: InputConfig) -> Frames:
     with closing(read_blocks(1)) as first:
         next(first)
     shape = (len(index), rows.stop - rows.start, columns.stop - columns.start)
-    return Frames(shape, source.dtype, index, _overridden(source.info, config), read_blocks)
+    return Frames(shape, source.dtype, index, calibrated(source.info, config), read_blocks)
 
 
 def _frame_slice(text: str) -> slice:
@@ -180,15 +180,30 @@ def _grey(source: Source, frame: NDArray[Any]) -> NDArray[Any]:
     )
 
 
-def _overridden(info: StackInfo, config: InputConfig) -> StackInfo:
+def calibrated(info: StackInfo, config: InputConfig) -> StackInfo:
+    """Let the frame interval and the pixel size of `config` beat those of the file.
+
+    Raises
+    ------
+    ConfigError
+        Where one isn't positive, or a size is given without its unit.
+    InputError
+        Where a unit is given and the size isn't known.
+    """
     for option, value in (("--frame-interval", config.frame_interval), ("--pixel-size", config.pixel_size)):
         if value is not None and not (0 < value < math.inf):
             raise ConfigError(f"{option} {value}: must be a positive number")
     if config.frame_interval is not None:
         info = replace(info, frame_interval=config.frame_interval, time_unit="s")
     if config.pixel_size is not None:
-        info = replace(info, pixel_size=config.pixel_size, pixel_unit=config.pixel_unit)
-    elif config.pixel_unit is not None:
+        if not config.pixel_unit:
+            raise ConfigError(f"--pixel-size {config.pixel_size}: needs --pixel-unit too, for example µm")
+        return replace(info, pixel_size=config.pixel_size, pixel_unit=config.pixel_unit)
+    if config.pixel_unit is not None:
+        if info.pixel_size is None:
+            raise InputError(
+                f"{info.source}: doesn't say how large a pixel is; give --pixel-size with --pixel-unit"
+            )
         info = replace(info, pixel_unit=config.pixel_unit)
     return info
 

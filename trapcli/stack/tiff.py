@@ -7,7 +7,7 @@ import json
 import math
 import uuid
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,6 +179,7 @@ def open_tiff(path: Path, name: str, config: InputConfig) -> Source:
         )
         reader = PlaneReader(name, layout.page, layout.planes)
         info = _info(name, tiff, layout.page, (*layout.warnings, *doubts, *log.warnings))
+        info = replace(info, files=tuple(file for file in chains.files if not file.samefile(path)))
     frames, channels = table.shape
     if channels > 1 and reader.samples > 1:
         raise InputError(f"{name}: has colours and {channels} channels; save the wanted channel alone")
@@ -205,6 +206,10 @@ class _Chains:
         self._name = name
         self._chains: dict[Path, Chain] = {}
         self._pages: dict[tuple[Path, int], Page] = {}
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return tuple(self._chains)
 
     def chain(self, path: Path) -> Chain:
         if path not in self._chains:

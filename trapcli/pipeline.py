@@ -1,0 +1,135 @@
+"""From frames to motion: the paper's workflow (``fig:workflow``) as one function.
+
+::
+
+    frames ──▶ attenuation ──▶ centres ──▶ reduced map ──▶ v, ω₃ ──▶ α ──▶ R ──▶ Motion
+               to_attenuation  └─────── estimate_paper or estimate_joint ───────┘
+
+Elbau, Ritsch-Marte, Scherzer and Schmutz, "Inverse problems of trapped objects", Inverse Problems 36 (2020).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trapcli.config import EstimateConfig, to_toml
+from trapcli.errors import ConfigError, InputError
+from trapcli.preprocess.attenuation import to_attenuation
+from trapcli.result import provenance
+from trapcli.result.motion import Motion
+from trapcli.stack.frames import Frames
+from trapcli.stack.source import calibrated
+
+Progress = Callable[[str, int, int], None]
+
+
+def estimate(
+    frames: Frames | NDArray[Any],
+    *,
+    frame_interval: float | None = None,
+    pixel_size: float | None = None,
+    pixel_unit: str | None = None,
+    attenuation: bool | None = None,
+    background: str | None = None,
+    method: str | None = None,
+    config: EstimateConfig | None = None,
+    progress: Progress | None = None,
+) -> Motion:
+    """Recover the rigid motion of the particle that the frames show.
+
+    Parameters
+    ----------
+    frames:
+        ``(N, H, W)`` raw intensities or attenuation projections, evenly spaced in time; an array, or the
+        `Frames` of `trapcli.stack.open_stack`.
+    frame_interval:
+        Seconds between frames; without it times are in frames.
+    pixel_size, pixel_unit:
+        Edge of a pixel and its unit; without them lengths are in pixels.
+    attenuation:
+        Whether the frames are attenuation or phase projections already, rather than raw intensities.
+    background:
+        Where the empty field comes from: ``auto``, ``median``, ``border``, ``none`` or the path of a file.
+    method:
+        ``auto`` or ``paper``.
+    config:
+        All other settings; each argument above that is given beats it. Its frames, region and channel are
+        for `open_stack` and don't select from `frames`.
+    progress:
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    Motion
+        In the geometry, gauge and units of the result file, with the resolved configuration among its
+        provenance; `Motion.identifiable` and `Motion.valid` say what can be trusted.
+
+    Raises
+    ------
+    ConfigError
+        For a setting that makes no sense.
+    InputError
+        Where the frames can't be read or show too little to estimate a motion from.
+    """
+    config = config or EstimateConfig()
+    config = replace(
+        config,
+        input=_given(
+            config.input, frame_interval=frame_interval, pixel_size=pixel_size, pixel_unit=pixel_unit
+        ),
+        preprocess=_given(config.preprocess, attenuation=attenuation, background=background),
+        motion=_given(config.motion, method=method),
+    )
+    recover = _method(config.motion.method)
+    if not isinstance(frames, Frames):
+        frames = _from_array(frames)
+    frames = replace(frames, info=calibrated(frames.info, config.input))
+    step, time_unit, pixel, length_unit = _units(frames)
+    projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
+    motion = recover(
+        projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
+    )
+    origin = provenance.collect(configuration=to_toml(config))
+    return replace(
+        motion, time_unit=time_unit, length_unit=length_unit, provenance=motion.provenance | origin
+    )
+
+
+def _given(table: Any, **values: Any) -> Any:
+    return replace(table, **{name: value for name, value in values.items() if value is not None})
+
+
+def _method(name: str) -> Callable[..., Motion]:
+    """Return the function for a method; each is imported only when it is used."""
+    if name == "paper":
+        from trapcli.motion.paper import estimate_paper
+
+        return estimate_paper
+    if name == "auto":
+        from trapcli.motion.joint import estimate_joint
+
+        return estimate_joint
+    raise ConfigError(f"--method {name}: must be auto or paper")
+
+
+def _from_array(frames: Any) -> Frames:
+    array = np.asarray(frames)
+    if array.ndim != 3 or 0 in array.shape or array.dtype.kind not in "biuf":
+        raise InputError(
+            f"array of {array.dtype} and shape {array.shape}: real frames x rows x columns are needed"
+        )
+    return Frames.from_array(array)
+
+
+def _units(frames: Frames) -> tuple[float, str, float, str]:
+    """Return step and unit of time, pixel size and unit of length; frames and pixels where not known."""
+    info = frames.info
+    step, time_unit = (info.frame_interval, info.time_unit) if info.frame_interval else (1.0, "frame")
+    if info.pixel_size and info.pixel_unit:
+        return step, time_unit, info.pixel_size, info.pixel_unit
+    return step, time_unit, 1.0, "pixel"
