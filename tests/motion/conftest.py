@@ -65,7 +65,7 @@ def render() -> Render:
 
 
 def derivative(values: Array, half: float, order: int, axis: int) -> Array:
-    """Return the derivative in the middle of an interval of half-width `half` from values at Chebyshev nodes."""
+    """Return the derivative in the middle of an interval from values at its Chebyshev nodes."""
     n = values.shape[axis]
     nodes = np.polynomial.chebyshev.chebpts1(n)
     unit = np.polynomial.chebyshev.chebder(np.eye(n), order) if order else np.eye(n)

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 WIDTHS = (3, 5, 7, 9, 11, 13, 17, 21, 27, 35, 45, 57, 73, 93, 119, 153, 195, 249, 319, 407, 521)
 """Widths of the windows that are tried [frames]."""
 
-ROOMS = (0, 1, 3, 6, 12, 24, 48, 96, 192)
+ROOMS = (0, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 """Distances to the nearer end of the series for which windows are chosen separately [frames]."""
 
 MAX_DEGREE = 10
@@ -183,9 +183,10 @@ def choose_filters(
     trial = _Trial(series, noise, _unit_kernel(correlation), width and width | 1)
     filters = []
     for order in orders:
-        central, error = trial.best(order, len(series))
+        central, error = trial.best(order, (len(series),))
         rooms = [room for room in ROOMS if room < central.width // 2]
-        windows = [trial.best(order, room)[0] for room in rooms]
+        # a window serves all frames up to the next room
+        windows = [trial.best(order, (room, max(room, 2 * room - 1)))[0] for room in rooms]
         filters.append(TimeFilter(order, (*rooms, central.width // 2), (*windows, central), error))
     return tuple(filters)
 
@@ -217,26 +218,22 @@ class _Trial:
     fixed_width: int
     _cut: dict[int, NDArray[Any]] = field(default_factory=dict)
 
-    def best(self, order: int, room: int) -> tuple[Window, float]:
-        """Return the window of least mean square error for frames `room` away from an end, and that error."""
+    def best(self, order: int, rooms: tuple[int, ...]) -> tuple[Window, float]:
+        """Return the window of least mean square error for frames with such rooms, and that error."""
         n = len(self.series)
         best, least = Window(order, min(n, order + 1 + order % 2)), np.inf
         closed: set[int] = set()
         for width in [w for w in WIDTHS if w <= n] if self.fixed_width == 0 else [min(self.fixed_width, n)]:
-            before = min(room, width // 2)
+            before = sorted({min(room, width // 2) for room in rooms})
+            central = before == [width // 2]
             # in a centred window the next higher degree of the other parity has the same weights
-            stride = 2 if 2 * before + 1 == width else 1
-            degrees = [d for d in range(order, min(MAX_DEGREE, width - 1) + 1, stride) if d not in closed]
-            weights = [_weights(-before, width, degree, order) for degree in degrees]
-            differences = [
-                # where the window is lopsided the bias begins with the very next degree
-                _against_higher_degree(w, before, d + (2 if 4 * before >= width else 1), order)
-                for w, d in zip(weights, degrees, strict=True)
+            degrees = [
+                d
+                for d in range(order, min(MAX_DEGREE, width - 1) + 1, 2 if central else 1)
+                if d not in closed
             ]
-            seen = self._mean_squares(differences, one_sided=stride == 1)
-            for degree, w, difference, power in zip(degrees, weights, differences, seen, strict=True):
-                expected = self.noise**2 * _gain(difference, self.kernel)
-                variance = self.noise**2 * _gain(w, self.kernel)
+            figures = np.array([self._figures(order, width, degrees, b, central) for b in before])
+            for degree, (variance, power, expected) in zip(degrees, figures.mean(axis=0).T, strict=True):
                 bias = max(0.0, power - expected)
                 if bias + variance < least:
                     best, least = Window(degree, width), bias + variance
@@ -244,6 +241,20 @@ class _Trial:
                 if bias > _BIAS_DECIDES * max(variance, expected):
                     closed.add(degree)
         return best, float(np.sqrt(least))
+
+    def _figures(self, order: int, width: int, degrees: list[int], before: int, central: bool) -> Array:
+        """Return ``(3, D)``: variance, and power seen and expected of the difference from a higher degree."""
+        # where the window is lopsided the bias begins with the very next degree
+        further = 2 if 4 * before >= width else 1
+        weights = [_weights(-before, width, degree, order) for degree in degrees]
+        differences = [
+            _against_higher_degree(w, before, d + further, order)
+            for w, d in zip(weights, degrees, strict=True)
+        ]
+        variance, expected = (
+            [self.noise**2 * _gain(f, self.kernel) for f in bank] for bank in (weights, differences)
+        )
+        return np.array([variance, self._mean_squares(differences, one_sided=not central), expected])
 
     def _mean_squares(self, filters: list[Array], one_sided: bool) -> list[float]:
         """Return the mean square of what each filter gives; infinite for filters longer than the series.
@@ -273,7 +284,7 @@ class _Trial:
             n, k = self.series.shape
             starts = np.unique(np.linspace(0, n - width, max(16, _SAMPLES // k)).astype(int))
             pieces = self.series[starts + np.arange(width)[:, None]]
-            self._cut[width] = pieces[:, np.isfinite(pieces).all(axis=(0, 2))]
+            self._cut[width] = np.ascontiguousarray(pieces[:, np.isfinite(pieces).all(axis=(0, 2))])
         return self._cut[width]
 
 
@@ -338,8 +349,13 @@ def _basis(offsets: NDArray[np.int64], degree: int) -> Array:
 
 def _derivative_at_zero(first: int, last: int, degree: int, order: int) -> Array:
     middle, half = _interval(first, last)
-    unit = np.polynomial.legendre.legder(np.eye(degree + 1), order)
-    return np.asarray(np.polynomial.legendre.legval(-middle / half, unit) / half**order)
+    value = np.polynomial.legendre.legval(-middle / half, _legendre_derivatives(degree, order))
+    return np.asarray(value / half**order)
+
+
+@lru_cache(maxsize=128)
+def _legendre_derivatives(degree: int, order: int) -> Array:
+    return np.asarray(np.polynomial.legendre.legder(np.eye(degree + 1), order))
 
 
 def _interval(first: int, last: int) -> tuple[float, float]:

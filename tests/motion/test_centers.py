@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trapcli.motion.centers import estimate_centers, object_radius, pixel_noise
+from trapcli.motion.translation import translation
+from trapcli.simulation.motions import PaperMotion
+from trapcli.simulation.phantoms import PaperPhantom
+from trapcli.stack.frames import Frames
+
+
+def centers_of(frames: np.ndarray, pixel_size: float = 1.0):  # type: ignore[no-untyped-def]
+    return estimate_centers(Frames.from_array(frames), pixel_size=pixel_size)
+
+
+@pytest.fixture(scope="module")
+def paper_frames(render) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[no-untyped-def]
+    """40 frames of 128² of the paper's phantom and the true centres."""
+    time = np.linspace(0, 0.5, 40)
+    frames = render(PaperPhantom(), PaperMotion(), time, 128, 0.2)
+    return frames, PaperPhantom().center[:2] - PaperMotion().T(time)[:, :2]
+
+
+def test_clean_frames_are_exact(paper_frames) -> None:  # type: ignore[no-untyped-def]
+    frames, true = paper_frames
+    found = centers_of(frames, 0.2)
+    assert np.abs(found.center - true).max() < 1e-9
+    assert found.mass == pytest.approx(np.full(40, PaperPhantom().mass), rel=1e-9)
+    assert not found.clipped.any()
+
+
+@pytest.mark.parametrize("shape", [(96, 128), (127, 100)])
+def test_origin_is_the_pixel_in_the_middle(shape: tuple[int, int]) -> None:
+    height, width = shape
+    rows, columns = np.mgrid[:height, :width]
+    blob = np.exp(-((columns - width // 2 - 7.25) ** 2 + (rows - height // 2 + 3.5) ** 2) / 50)
+    found = centers_of(np.array([blob, blob]), 0.5)
+    assert found.center[0] == pytest.approx([3.625, -1.75], abs=1e-9)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.3])
+def test_noise_of_one_percent(level: float, render) -> None:  # type: ignore[no-untyped-def]
+    time = np.linspace(0, 0.5, 100)
+    frames = render(PaperPhantom(), PaperMotion(), time, 256, 0.1)
+    peak = frames.max()
+    rng = np.random.default_rng(4)
+    noisy = (frames + peak * (level + 0.01 * rng.standard_normal(frames.shape))).astype(np.float32)
+    found = centers_of(noisy)
+    true = (PaperPhantom().center[:2] - PaperMotion().T(time)[:, :2]) / 0.1
+    assert np.abs(found.center - true).max() < 0.03
+    assert found.noise == pytest.approx(0.01 * peak, rel=0.05)
+    assert found.level == pytest.approx(np.full(100, level * peak), abs=0.001 * peak)
+
+
+def test_errors_come_true(render, blobs) -> None:  # type: ignore[no-untyped-def]
+    time = np.zeros(1)
+    clean = render(blobs, PaperMotion(), time, 64, 0.25)[0]
+    rng = np.random.default_rng(0)
+    # a jittering object: what is not smooth must not be smoothed
+    jitter = rng.integers(-3, 4, (150, 2))
+    frames = np.array([np.roll(clean, tuple(j), axis=(0, 1)) for j in jitter])
+    noisy = frames + 0.01 * clean.max() * rng.standard_normal(frames.shape)
+    found = centers_of(noisy)
+    off = found.center - jitter[:, ::-1]
+    pull = (off - off.mean(axis=0)) / found.errors
+    assert 0.75 < pull.std() < 1.3
+
+
+def test_blank_frames_are_unknown(paper_frames) -> None:  # type: ignore[no-untyped-def]
+    frames = paper_frames[0][:20].copy()
+    rng = np.random.default_rng(1)
+    frames += 0.002 * frames.max() * rng.standard_normal(frames.shape)
+    frames[[0, 5]] = 0.002 * frames.max() * rng.standard_normal((2, 128, 128))
+    frames[9] = np.nan
+    found = centers_of(frames)
+    blank = np.isnan(found.center[:, 0])
+    assert np.flatnonzero(blank).tolist() == [0, 5, 9]
+    assert np.isnan(found.errors[blank]).all()
+    T = translation(found.center)
+    assert np.array_equal(T[1], [0, 0])
+    assert np.isnan(T[0]).all()
+
+
+def test_nothing_at_all() -> None:
+    assert np.isnan(centers_of(np.zeros((3, 16, 16))).center).all()
+    assert np.isnan(centers_of(np.full((3, 16, 16), np.nan)).center).all()
+    assert np.isnan(translation(np.full((3, 2), np.nan))).all()
+
+
+def test_object_at_the_edge_is_seen_to_be_clipped(paper_frames) -> None:  # type: ignore[no-untyped-def]
+    cut = paper_frames[0][:6, :, 50:]
+    assert centers_of(cut).clipped.all()
+
+
+def test_another_type_of_pixel(paper_frames) -> None:  # type: ignore[no-untyped-def]
+    frames, true = paper_frames
+    counts = np.round(frames / frames.max() * 65535).astype(np.uint16)
+    assert np.abs(centers_of(counts, 0.2).center - true).max() < 1e-4
+
+
+def test_noise_and_radius_of_a_ball() -> None:
+    rng = np.random.default_rng(2)
+    rows, columns = np.mgrid[:128, :128] - 64
+    ball = np.sqrt(np.maximum(25**2 - rows**2 - columns**2, 0)) / 25
+    images = ball + 0.05 * rng.standard_normal((8, 128, 128))
+    assert pixel_noise(images) == pytest.approx(0.05, rel=0.1)
+    assert object_radius(images, 0.05) == pytest.approx(25, abs=2.1)
+
+
+def test_progress_is_told(paper_frames) -> None:  # type: ignore[no-untyped-def]
+    told: list[tuple[str, int, int]] = []
+    frames = Frames.from_array(paper_frames[0])
+    estimate_centers(frames, progress=lambda *what: told.append(what))
+    assert told[-1] == ("centers", 40, 40)
