@@ -81,7 +81,9 @@ class Evidence:
                 damped = hessian + np.diag(damping * diagonal + 1e-6 * diagonal.mean() + 1e-300)
                 step = np.linalg.solve(damped, gradient).reshape(-1, 3)
                 largest = np.linalg.norm(values @ step, axis=1).max()
-                tried = self.judge(best.path.bent(spline, step * min(1.0, _LARGEST_STEP / max(largest, 1e-300))))
+                tried = self.judge(
+                    best.path.bent(spline, step * min(1.0, _LARGEST_STEP / max(largest, 1e-300)))
+                )
                 if tried.cost < best.cost:
                     break
                 damping *= 8

@@ -19,7 +19,9 @@ Index = NDArray[np.intp]
 
 _E3 = cross_matrix(np.array([0.0, 0.0, 1.0]))
 _FINEST_ANGLES = 128  # least samples over the whole turn for cubic interpolation
-_SHORT_BASELINE = 0.02  # sin² of the angle between viewing directions below which a common line is ill-determined
+_SHORT_BASELINE = (
+    0.02  # sin² of the angle between viewing directions below which a common line is ill-determined
+)
 _OUTLYING = 8.0  # misfit per degree of freedom from which a pair counts less
 
 
@@ -138,7 +140,9 @@ class LineTable:
         cost = trusted * scale * np.log1p(misfit / scale) + (1 - trusted) * self.degrees
         return cost, trusted / (1 + misfit / scale)
 
-    def _interpolate(self, frame: Index, angle: Array) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
+    def _interpolate(
+        self, frame: Index, angle: Array
+    ) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
         """Return cubic Hermite interpolants of J̃ and their slopes, ``(P, M)``."""
         x = np.mod(angle, 2 * np.pi) * (self._angles / (2 * np.pi))
         left = np.floor(x).astype(np.intp)
@@ -190,5 +194,7 @@ def _angle_derivatives(q: Array, p: Array, Q: Array, sin2: Array) -> tuple[Array
         return np.asarray(np.einsum("pi,pij->pj", vector, matrix))
 
     angle_s = np.concatenate([row(along_q, cross_matrix(q)), -row(along_q, Q @ _E3)], axis=1)
-    angle_t = np.concatenate([-row(along_p, np.swapaxes(Q, 1, 2) @ _E3), row(along_p, cross_matrix(p))], axis=1)
+    angle_t = np.concatenate(
+        [-row(along_p, np.swapaxes(Q, 1, 2) @ _E3), row(along_p, cross_matrix(p))], axis=1
+    )
     return angle_s, angle_t

@@ -123,7 +123,9 @@ def read_low_band(
     half = int(np.ceil(SQUARE * centers.radius / pixel_size))
     offset = (np.arange(2 * half) - half) * pixel_size
     edge = 2 * half * pixel_size
-    frequency = 2 * np.pi / edge * np.arange(-int(band * edge / (2 * np.pi)), int(band * edge / (2 * np.pi)) + 1)
+    frequency = (
+        2 * np.pi / edge * np.arange(-int(band * edge / (2 * np.pi)), int(band * edge / (2 * np.pi)) + 1)
+    )
     wave = np.exp(-1j * np.outer(frequency, offset))
     k1, k2 = np.meshgrid(frequency, frequency)
     kept = (np.hypot(k1, k2) <= band) & ((k2 > 0) | ((k2 == 0) & (k1 >= 0)))
@@ -144,7 +146,9 @@ def read_low_band(
                 rest = (center - whole) * pixel_size
                 spectrum = (wave @ square @ wave.T)[kept]
                 modes[done] = measure * spectrum * np.exp(1j * k @ rest)
-                second[done], third[done], mass[done] = _moments(square, offset, rest, centers.radius, pixel_size)
+                second[done], third[done], mass[done] = _moments(
+                    square, offset, rest, centers.radius, pixel_size
+                )
             done += 1
         if progress is not None:
             progress("low band", done, n)
@@ -172,7 +176,9 @@ def _cut(image: NDArray[np.generic], center: NDArray[np.int_], half: int) -> Arr
     square = np.zeros((2 * half, 2 * half))
     rows = slice(max(top, 0), min(top + 2 * half, height))
     columns = slice(max(left, 0), min(left + 2 * half, width))
-    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[rows, columns]
+    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[
+        rows, columns
+    ]
     return square
 
 
@@ -189,7 +195,9 @@ def _monomials(offset: Array, rest: Array, radius: float) -> tuple[Array, list[A
     return weight, [x1**2, x1 * x2, x2**2, x1**3, x1**2 * x2, x1 * x2**2, x2**3]
 
 
-def _moments(square: Array, offset: Array, rest: Array, radius: float, pixel_size: float) -> tuple[Array, Array, float]:
+def _moments(
+    square: Array, offset: Array, rest: Array, radius: float, pixel_size: float
+) -> tuple[Array, Array, float]:
     weight, monomials = _monomials(offset, rest, radius)
     weighted = (square * weight).ravel() * pixel_size**2
     values = np.array([m.ravel() @ weighted for m in monomials])

@@ -1,0 +1,431 @@
+"""The joint estimate from attenuation to motion: ``--method auto``.
+
+Common lines at all baselines and moments find the motion without a starting value (`branch`); a low-frequency model of
+the object, eliminated exactly, refines it and judges it (`object_model`). The misfit that remains, per degree of
+freedom, is 1 where pixel noise explains it: the certificate of the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trapcli.config import MotionConfig
+from trapcli.errors import InputError
+from trapcli.motion.branch import Evidence, Hypothesis, find_branches
+from trapcli.motion.centers import Centers, Progress, estimate_centers, object_radius, sample_frames
+from trapcli.motion.common_line import LineTable
+from trapcli.motion.low_band import LowBand, read_low_band
+from trapcli.motion.moments import MomentTable
+from trapcli.motion.object_model import Fit, ObjectModel
+from trapcli.motion.path import Path, Spline
+from trapcli.motion.reduced_map import reduce_frames
+from trapcli.motion.translation import translation
+from trapcli.motion.types import ReducedMap
+from trapcli.result.motion import Flag, Motion
+from trapcli.stack.frames import Frames
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+_FEWEST = 12  # frames
+_LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the model's own errors dominate
+_LEAST_VISIBLE = 2e-3  # share of the peak at which the object ends
+_LINE_BAND = 8.0  # band times radius for common lines
+_FINE_BAND = 12.0  # band times radius for the object model
+_LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
+_FINE_GROUP = np.deg2rad(1.0)  # the same, to refine it, at noise of 1 % of the peak
+_FEWEST_GROUPS = 30
+_LINE_ERROR = 0.01  # model error of the lines, as a share of the map
+_MOMENT_ERROR = 0.002  # model error of the moments, as a share of their size
+_ATTEMPTS = (
+    (50, 0.5),
+    (80, 0.5),
+    (50, 0.15),
+    (50, 0.85),
+    (120, 0.5),
+)  # first window [groups] and where it lies
+_FITS = 1.5  # misfit per degree of freedom of lines and moments at which no other window is tried
+_RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refined as well
+_KNOT_ANGLES = np.deg2rad((24.0, 12.0, 6.0))  # rotation per interval of the spline, coarse to fine
+_CERTIFIED = 1.08  # misfit per degree of freedom that pixel noise explains
+_MODEL_ERROR = 0.12  # misfit, as a share of what changes in the images, that an imperfect model may leave
+_UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
+_FAINT = 2.0  # standard deviations below which α does not differ from 0
+_OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
+_SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
+
+
+def estimate_joint(
+    attenuation: Frames,
+    config: MotionConfig,
+    *,
+    time: Array,
+    pixel_size: float = 1.0,
+    progress: Progress | None = None,
+) -> Motion:
+    """Recover the motion from all frames at once, with errors and a verdict.
+
+    Parameters
+    ----------
+    attenuation:
+        N attenuation projections.
+    config:
+        `band` and `knots` are used.
+    time:
+        ``(N,)`` ascending times.
+    pixel_size:
+        Edge of a pixel [length].
+    progress:
+        Called as ``progress(stage, done, total)``.
+
+    Returns
+    -------
+    Motion
+        In the units of `time` and `pixel_size`, which the caller names.
+
+    Raises
+    ------
+    InputError
+        Where fewer than 12 frames show an object.
+    """
+    centers = _estimate_centers(attenuation, pixel_size, progress)
+    seen = np.isfinite(centers.center).all(axis=1)
+    if seen.sum() < _FEWEST:
+        raise InputError(
+            f"{attenuation.info.source}: {seen.sum()} frames show an object; at least {_FEWEST} are needed"
+        )
+    line_band = min(_LINE_BAND / centers.radius, config.band or np.inf)
+    fine_band = config.band or _FINE_BAND / centers.radius
+    reduced = reduce_frames(
+        attenuation, centers, time=time, pixel_size=pixel_size, band=line_band, progress=progress
+    )
+    low = read_low_band(
+        attenuation, centers, time=time, band=fine_band, pixel_size=pixel_size, progress=progress
+    )
+    outlying = np.zeros(len(time), bool)
+    outlying[seen] = _outliers(low.select(np.flatnonzero(seen)))
+    stack = _Stack(reduced, low, centers, seen, outlying, attenuation.index)
+    used = np.flatnonzero(seen & ~outlying)
+    pace = _turn_per_frame(reduced.samples[used], reduced.noise)
+    if pace == 0.0:
+        return _nothing_known(
+            stack,
+            "nothing changes between the frames beyond the noise: the object is still, "
+            "or turns about an axis of symmetry; no rotation can be told",
+        )
+    hypotheses = _hypotheses(stack, used, pace, progress)
+    fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in hypotheses]
+    fit = min(fits, key=lambda f: f.cost)
+    return _motion(stack, fit, _judge(fit))
+
+
+@dataclass(frozen=True)
+class _Stack:
+    """What is known of the frames before any motion."""
+
+    reduced: ReducedMap
+    low: LowBand
+    centers: Centers
+    seen: Bools
+    outlying: Bools
+    frame: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Verdict:
+    identifiable: bool
+    text: str
+
+
+def _estimate_centers(attenuation: Frames, pixel_size: float, progress: Progress | None) -> Centers:
+    """Return the centres, with a radius and a noise that suit the low band."""
+    centers = estimate_centers(attenuation, pixel_size=pixel_size, progress=progress)
+    survey = sample_frames(attenuation)
+    if not len(survey):
+        return centers
+    peak = float(np.quantile(survey, 0.9999) - np.median(survey))
+    radius = object_radius(survey, max(centers.noise, _LEAST_VISIBLE * peak)) * pixel_size
+    return replace(centers, radius=min(radius, centers.radius), noise=max(centers.noise, _LEAST_NOISE * peak))
+
+
+def _outliers(low: LowBand) -> Bools:
+    """Tell which frames differ from their neighbours far more than is usual in their part of the stack."""
+    n = len(low.time)
+    good = np.ones(n, bool)
+    while True:
+        kept = np.flatnonzero(good)
+        modes = low.modes[kept]
+        middle = modes[1:-1] - 0.5 * (modes[:-2] + modes[2:])
+        misfit = np.mean(np.abs(middle) ** 2, axis=1) / (1.5 * low.variance)
+        # a flash spoils the differences of its neighbours too: only the worst of each three is judged
+        padded = np.concatenate([[0.0], misfit, [0.0]])
+        worst = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+        typical = np.array([np.median(misfit[max(0, i - 12) : i + 13]) for i in range(len(misfit))])
+        bad = worst & (misfit > _OUTLYING * np.maximum(typical, 1.0))
+        if not bad.any() or good.sum() - bad.sum() < 0.8 * n:
+            return ~good
+        good[kept[1:-1][bad]] = False
+
+
+def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float:
+    """Return roughly the rotation from frame to frame [rad]; 0 where nothing changes.
+
+    Turning by θ in the image changes J̃ by θ ∂φJ̃, and turning out of it by about as much.
+    """
+    n, rings, lines = samples.shape
+    turn = np.concatenate([samples, samples.conj()], axis=2)
+    order = np.fft.fftfreq(2 * lines, 1 / (2 * lines))
+    slope = np.fft.ifft(np.fft.fft(turn, axis=2) * (1j * order), axis=2)
+    structure = float(np.mean(np.abs(slope) ** 2))
+    # noise of ∂φJ̃ by its own share of the spectrum: white along φ up to the band
+    independent = n * rings
+    lag, best = 1, 0.0
+    while lag <= max(1, n // 2):
+        change = float(np.mean(np.abs(samples[lag:] - samples[:-lag]) ** 2)) - 2 * noise**2
+        error = 2 * noise**2 / np.sqrt(max(independent / lag, 1.0))
+        if change > _SIGNIFICANT * error:
+            pace = np.sqrt(change / structure) / lag
+            if change > noise**2 or best:
+                return float(pace)
+            best = float(pace)
+        lag *= 2
+    return best
+
+
+def _grouped(stack: _Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
+    """Return means over groups of `size` consecutive used frames."""
+    low = stack.low.select(used).grouped(size)
+    groups = len(low.time)
+    samples = stack.reduced.samples[used[: groups * size]]
+    mean = samples.reshape(groups, size, *samples.shape[1:]).mean(axis=1)
+    return replace(stack.reduced, samples=mean, time=low.time, noise=stack.reduced.noise / np.sqrt(size)), low
+
+
+def _hypotheses(
+    stack: _Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
+) -> list[Hypothesis]:
+    """Return the motions that common lines and moments allow, best first."""
+    size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
+    reduced, low = _grouped(stack, used, size)
+    evidence = Evidence(low.time, LineTable(reduced, _LINE_ERROR), MomentTable(low, _MOMENT_ERROR))
+    best: list[Hypothesis] = []
+    for attempt, (window, middle) in enumerate(_ATTEMPTS):
+        tried = replace(evidence, seed=attempt)
+        found = find_branches(tried, window=window, middle=middle, progress=progress)
+        judged = sorted((evidence.judge(h.path) for h in found), key=lambda h: h.cost)
+        if not best or judged[0].cost < best[0].cost:
+            best = judged
+        if best[0].lines < _FITS and best[0].moments < _FITS:
+            break
+    return [h for h in best[:2] if h.cost <= _RIVAL * best[0].cost]
+
+
+def _refine(
+    stack: _Stack, used: NDArray[np.intp], hypothesis: Hypothesis, pace: float, band: float, knots: int
+) -> Fit:
+    """Fit the object model along a hypothesis, with as many knots as the data pay for."""
+    fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
+    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
+    _, low = _grouped(stack, used, size)
+    time = stack.low.time
+    turned = float(np.linalg.norm(hypothesis.path.mean_omega(), axis=1).mean() * np.ptp(low.time))
+    intervals = [knots] if knots else [max(4, round(turned / angle)) for angle in _KNOT_ANGLES]
+    best: Fit | None = None
+    for count in intervals:
+        if best is not None and 3 * count > len(low.time):
+            break
+        spline = Spline(time[0], time[-1], count)
+        if best is None:
+            path = _resampled(hypothesis.path, spline, np.concatenate([time, low.time]))
+        else:
+            path, low = best.path, replace(low, k=best.low.k, modes=best.low.modes)
+        fit = ObjectModel(low, band).fit(path, low.time, spline)
+        if best is not None:
+            fit = replace(fit, shift=fit.shift + best.shift)
+            # Akaike: a parameter must lower the misfit by 2
+            if best.cost - fit.cost < 2 * 3 * (fit.spline.size - best.spline.size):
+                break
+        best = fit
+    assert best is not None
+    if best.cost / best.degrees > _CERTIFIED:
+        return _with_model_error(best, band)
+    return best
+
+
+def _relative_noise(stack: _Stack) -> float:
+    """Return the pixel noise as a share of a typical attenuation of the object."""
+    area = np.pi * stack.centers.radius**2
+    return float(stack.centers.noise * area / np.nanmedian(stack.low.mass)) / 3
+
+
+def _with_model_error(fit: Fit, band: float) -> Fit:
+    """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
+    variance = fit.low.variance * np.maximum(fit.ring_misfit, 1.0)
+    again = ObjectModel(fit.low, band, variance=variance).fit(fit.path, fit.low.time, fit.spline)
+    excess = np.maximum(fit.ring_misfit, 1.0)
+    return replace(
+        again,
+        shift=again.shift + fit.shift,
+        ring_misfit=again.ring_misfit * excess,
+        cost=fit.cost,
+        degrees=fit.degrees,
+    )
+
+
+def _resampled(path: Path, spline: Spline, times: Array) -> Path:
+    """Return the path of the spline nearest to ω of `path`, at other times."""
+    middle = 0.5 * (path.time[1:] + path.time[:-1])
+    ascending, back = np.unique(times, return_inverse=True)
+    smooth = Path.smooth(spline, spline.fit(middle, path.mean_omega()), ascending)
+    return Path(times, smooth.R[back], smooth.omega[back])
+
+
+def _judge(fit: Fit) -> _Verdict:
+    """Say whether the misfit is what the noise leaves, or what else it is."""
+    misfit = fit.cost / fit.degrees
+    if misfit <= _CERTIFIED:
+        return _Verdict(True, f"the motion explains the images: misfit {misfit:.3f} of what the noise gives")
+    changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
+    share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
+    left = float(np.sum(share * np.maximum(fit.ring_misfit - 1, 0.0)) * fit.low.variance)
+    error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
+    if error <= _MODEL_ERROR:
+        return _Verdict(
+            True,
+            f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
+            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it",
+        )
+    return _Verdict(
+        False,
+        f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them is "
+        f"left over, {misfit:.1f} times the noise",
+    )
+
+
+def _nothing_known(stack: _Stack, text: str) -> Motion:
+    """Return a result without rotation."""
+    n = len(stack.low.time)
+    unknown = np.full(n, np.nan)
+    flags = _flags(stack)
+    flags[stack.seen] |= np.uint16(Flag.ALPHA_ZERO | Flag.AMBIGUOUS_PHI)
+    R = np.full((n, 3, 3), np.nan)
+    return Motion(
+        time=stack.low.time,
+        frame=stack.frame,
+        T=translation(stack.centers.center),
+        center=stack.centers.center,
+        phi=unknown,
+        omega_3=unknown,
+        alpha=unknown,
+        R=R,
+        T_errors=np.hypot(stack.centers.errors, stack.centers.errors[np.flatnonzero(stack.seen)[0]]),
+        phi_errors=unknown,
+        omega_3_errors=unknown,
+        alpha_errors=unknown,
+        R_errors=np.full((n, 3), np.nan),
+        valid=np.zeros(n, np.uint8),
+        flags=flags,
+        residual=unknown,
+        identifiable=False,
+        verdict=text,
+    )
+
+
+def _flags(stack: _Stack) -> NDArray[np.uint16]:
+    flags = np.zeros(len(stack.seen), np.uint16)
+    flags[~stack.seen] |= np.uint16(Flag.BLANK)
+    flags[stack.centers.clipped] |= np.uint16(Flag.CLIPPED)
+    flags[stack.outlying] |= np.uint16(Flag.OUTLIER)
+    return flags
+
+
+def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
+    """Put the fitted path into the gauge of the result, with errors and flags."""
+    time = stack.low.time
+    n = len(time)
+    R, omega = fit.path.R[:n], fit.path.omega[:n]
+    R = R[0].T @ R
+    values, slopes = fit.spline.values(time), fit.spline.slopes(time)
+    R_covariance = _rotation_covariance(R, values, fit.covariance)
+    omega_covariance = _omega_covariance(omega, values, slopes, fit.covariance)
+    alpha = np.hypot(omega[:, 0], omega[:, 1])
+    v = omega[:, :2] / np.maximum(alpha, 1e-300)[:, None]
+    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
+    plane = omega_covariance[:, :2, :2]
+    alpha_errors = np.sqrt(np.einsum("ni,nij,nj->n", v, plane, v))
+    sideways = np.sqrt(np.einsum("ni,nij,nj->n", across, plane, across))
+    R_errors = np.sqrt(np.maximum(np.diagonal(R_covariance, axis1=1, axis2=2), 0.0))
+
+    flags = _flags(stack)
+    lost = np.linalg.norm(R_errors, axis=1) > _UNKNOWN
+    faint = alpha < _FAINT * np.maximum(alpha_errors, sideways)
+    flags[faint] |= np.uint16(Flag.ALPHA_ZERO)
+    judged = stack.seen & ~lost
+    valid = judged & (flags & np.uint16(Flag.OUTLIER | Flag.BLANK) == 0)
+    text = verdict.text
+    identifiable = verdict.identifiable and bool(valid.mean() > 0.5)
+    if verdict.identifiable and not identifiable:
+        text = "the images leave the rotation open by more than 20 degrees: a symmetric object, too much noise or too little rotation"
+
+    phi = np.where(judged & ~faint, np.arctan2(omega[:, 1], omega[:, 0]), np.nan)
+    known = np.flatnonzero(np.isfinite(phi))
+    if len(known):
+        phi[known] = np.unwrap(phi[known])
+        first = phi[known[0]]
+        half_turns = np.floor(first / np.pi)
+        # an odd number of half turns is the mirror image, R → ΣRΣ
+        if half_turns % 2:
+            sigma = np.diag([1.0, 1.0, -1.0])
+            R = sigma @ R @ sigma
+        phi = phi - half_turns * np.pi
+    unknown = ~judged
+    shift = np.stack([np.interp(time, fit.low.time, s) for s in fit.shift.T], axis=1)
+    shift_errors = np.stack([np.interp(time, fit.low.time, s) for s in fit.shift_errors.T], axis=1)
+    center = stack.centers.center + shift
+    size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
+    residual = np.interp(time, fit.low.time, np.sqrt(fit.frame_misfit * fit.low.variance)) / size
+    R_errors[unknown] = np.nan
+    R = np.where(unknown[:, None, None], np.nan, R)
+    return Motion(
+        time=time,
+        frame=stack.frame,
+        T=translation(center),
+        center=center,
+        phi=phi,
+        omega_3=np.where(unknown, np.nan, omega[:, 2]),
+        alpha=np.where(unknown, np.nan, alpha),
+        R=R,
+        T_errors=np.hypot(shift_errors, shift_errors[0]),
+        phi_errors=np.where(np.isfinite(phi), sideways / np.maximum(alpha, 1e-300), np.nan),
+        omega_3_errors=np.where(unknown, np.nan, np.sqrt(omega_covariance[:, 2, 2])),
+        alpha_errors=np.where(unknown, np.nan, alpha_errors),
+        R_errors=R_errors,
+        valid=(valid & identifiable).astype(np.uint8),
+        flags=flags,
+        residual=np.where(stack.seen, residual, np.nan),
+        identifiable=identifiable,
+        verdict=text,
+    )
+
+
+def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
+    """Return ``(N, 3, 3)`` covariances of R as rotation vectors in lab coordinates, R = 1 at the first frame."""
+    # the first frame's error turns all others: ε(t) − R(t)ᵀ R(0) ε(0)
+    back = np.swapaxes(R, 1, 2) @ R[0]
+    own = np.einsum("nb,bicj,nc->nij", values, covariance, values, optimize=True)
+    mixed = np.einsum("nb,bicj,c->nij", values, covariance, values[0], optimize=True)
+    start = np.einsum("b,bicj,c->ij", values[0], covariance, values[0], optimize=True)
+    turned = mixed @ np.swapaxes(back, 1, 2)
+    return np.asarray(own - turned - np.swapaxes(turned, 1, 2) + back @ start @ np.swapaxes(back, 1, 2))
+
+
+def _omega_covariance(omega: Array, values: Array, slopes: Array, covariance: Array) -> Array:
+    """Return ``(N, 3, 3)`` covariances of ω; δω = δ' + ω × δ."""
+    x, y, z = omega.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    design = np.einsum("nb,ij->nibj", slopes, np.eye(3)) + np.einsum("ijn,nb->nibj", cross, values)
+    return np.asarray(np.einsum("nibj,bjck,nlck->nil", design, covariance, design, optimize=True))

@@ -1,0 +1,323 @@
+"""A low-frequency model of the object, eliminated exactly: the likelihood of a motion.
+
+The object is a sum of Gaussian blobs on a cubic lattice; their amplitudes enter the frames' low-frequency modes
+linearly and are solved for at every motion (variable projection; Golub and Pereyra 2003, DOI
+10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's shift is eliminated with
+them, so that centring costs nothing. All sums over frames are non-uniform Fourier transforms on the lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import finufft
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from trapcli.motion.low_band import LowBand
+from trapcli.motion.path import Path, Spline
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+SPACING = 0.7
+"""Lattice spacing in units of π / band; coarser than 0.75 the lattice can't hold the band."""
+
+_WIDTH = 0.8  # standard deviation of a blob in lattice spacings
+_MARGIN = 0.3  # lattice beyond the object's radius, in spacings
+_PRECISION = 1e-13  # of the transforms: the normal matrix spans ten orders of magnitude
+_FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
+_STEPS = 6
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A motion fitted to the frames' low band.
+
+    Attributes
+    ----------
+    path:
+        R and ω at the times that were asked for.
+    low:
+        The data, centred as the model wants them.
+    shift:
+        ``(G, 2)`` by how much the centres moved [length].
+    shift_errors:
+        ``(G, 2)`` [length].
+    cost, degrees:
+        Misfit and its expectation, ``cost / degrees`` is 1 where the noise explains it.
+    frame_misfit:
+        ``(G,)`` misfit of each frame per mode.
+    ring_misfit:
+        ``(K,)`` misfit of each mode.
+    spline, covariance:
+        The last spline and the ``(size, 3, size, 3)`` covariance of its coefficients.
+    """
+
+    path: Path
+    low: LowBand
+    shift: Array
+    shift_errors: Array
+    cost: float
+    degrees: float
+    frame_misfit: Array
+    ring_misfit: Array
+    spline: Spline
+    covariance: Array
+
+
+class ObjectModel:
+    """Normal equations of the object's amplitudes for any motion.
+
+    Parameters
+    ----------
+    low:
+        Modes of G frames; those beyond `band` are not used.
+    band:
+        Highest spatial frequency [rad / length].
+    variance:
+        ``(K,)`` noise of each mode, model error included; None for white noise.
+    weights:
+        ``(G,)`` weight of each frame.
+    """
+
+    def __init__(
+        self, low: LowBand, band: float, *, variance: Array | None = None, weights: Array | None = None
+    ) -> None:
+        inside = np.hypot(low.k[:, 0], low.k[:, 1]) <= band * (1 + 1e-9)
+        self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
+        self.band = band
+        self.variance = np.full(inside.sum(), low.variance) if variance is None else variance
+        self.weights = np.ones(len(low.time)) if weights is None else weights
+        # k = 0 is its own conjugate, every other mode stands for two
+        self._share = np.where((self.low.k == 0).all(axis=1), 1.0, 2.0)
+        self.spacing = SPACING * np.pi / band
+        reach = low.radius + _MARGIN * self.spacing
+        self._half = int(reach / self.spacing)
+        axis = np.arange(-self._half, self._half + 1)
+        cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+        self._mask = np.linalg.norm(cube, axis=-1) * self.spacing <= reach
+        self._index = cube[self._mask]
+        self.position = self._index * self.spacing
+        radial = np.hypot(self.low.k[:, 0], self.low.k[:, 1])
+        blob = np.exp(-0.5 * (_WIDTH * self.spacing * radial) ** 2)
+        power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
+        power = np.maximum(power - self.variance, 0.01 * self.variance)
+        # amplitudes of unit variance then give at least the power that is seen
+        self._blob = blob * np.sqrt(np.max(power / blob**2) / len(self._index))
+        edge = 4 * self._half + 1
+        flat = (self._index[:, 0] * edge + self._index[:, 1]) * edge + self._index[:, 2]
+        middle = (2 * self._half * edge + 2 * self._half) * edge + 2 * self._half
+        self._difference = flat[:, None] - flat[None, :] + middle
+
+    @property
+    def data_count(self) -> float:
+        """Real numbers that the frames hold, by their weights."""
+        return float(self._share.sum() * self.weights.sum())
+
+    def cost(self, R: Array, modes: ComplexArray) -> float:
+        """Return the misfit of ``(G, 3, 3)`` rotations to ``(G, K)`` modes, the object eliminated."""
+        normal, right = self._normal(R, modes)
+        factor = scipy.linalg.cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
+        half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+        return self._square(modes) - float(half @ half)
+
+    def fit(self, path: Path, times: Array, spline: Spline, *, steps: int = _STEPS) -> Fit:
+        """Bend `path` to the least misfit (Gauss–Newton on the projected misfit).
+
+        Parameters
+        ----------
+        path:
+            R and ω at the times asked for, followed by the G group times.
+        times:
+            The G group times.
+        spline:
+            What bends the path.
+        """
+        groups = len(times)
+        values = spline.values(times)
+        low, shift = self.low, np.zeros((groups, 2))
+        hessian: Array | None = None
+        old = np.inf
+        for _ in range(steps):
+            normal, right, state = self._state(path.R[-groups:], low.modes)
+            moved = self._shift_step(state)[0]
+            shift, low = shift + moved, low.shifted(moved)
+            normal, right, state = self._state(path.R[-groups:], low.modes)
+            if hessian is None:
+                hessian = self._hessian(path.R[-groups:], normal, state, values)
+            step, gain, tried = self._search(path, low, spline, hessian, state, values)
+            if not gain > 0:
+                break
+            path = tried
+            slow = gain > 0.3 * old
+            old = gain
+            if gain < 0.5:
+                break
+            if slow:
+                hessian = None
+        normal, right, state = self._state(path.R[-groups:], low.modes)
+        return self._finish(path, low, shift, spline, normal, state, values)
+
+    # ------------------------------------------------------------------ one motion
+
+    def _square(self, modes: ComplexArray) -> float:
+        return float(np.sum(self.weights[:, None] * self._share / self.variance * np.abs(modes) ** 2))
+
+    def _points(self, R: Array) -> list[Array]:
+        """Return where the frames' modes lie in the object's Fourier space, in units of the lattice."""
+        points = (R[:, :, :2] @ self.low.k.T) * self.spacing
+        return [np.ascontiguousarray(points[:, axis].ravel()) for axis in range(3)]
+
+    def _normal(self, R: Array, modes: ComplexArray) -> tuple[Array, Array]:
+        """Return the normal matrix and the right-hand side of the amplitudes, prior included."""
+        points = self._points(R)
+        weight = self.weights[:, None] * self._share * self._blob / self.variance
+        edge, size = 4 * self._half + 1, 2 * self._half + 1
+        kernel = finufft.nufft3d1(
+            *points, (weight * self._blob).ravel().astype(complex), (edge,) * 3, isign=1, eps=_PRECISION
+        ).real
+        right = finufft.nufft3d1(*points, (weight * modes).ravel(), (size,) * 3, isign=1, eps=_PRECISION)
+        normal = kernel.ravel()[self._difference]
+        normal[np.diag_indices(len(normal))] += 1.0
+        return normal, np.asarray(right.real[self._mask])
+
+    def _state(self, R: Array, modes: ComplexArray) -> tuple[Array, Array, _State]:
+        """Solve for the object; return its normal equations and what the gradient needs."""
+        normal, right = self._normal(R, modes)
+        factor = scipy.linalg.cho_factor(normal, lower=True, check_finite=False)
+        amplitude = scipy.linalg.cho_solve(factor, right, check_finite=False)
+        volume = np.zeros((4, *self._mask.shape), complex)
+        volume[0][self._mask] = amplitude
+        for axis in range(3):
+            volume[axis + 1][self._mask] = amplitude * self.position[:, axis]
+        model, *gradient = self._blob * finufft.nufft3d2(
+            *self._points(R), volume, isign=-1, eps=_PRECISION
+        ).reshape(4, *modes.shape)
+        g1, g2, g3 = np.einsum("gji,jgk->igk", R, np.array(gradient))
+        k1, k2 = self.low.k.T
+        # R → R exp([ε]×) moves the mode at R k by R (ε × k)
+        slopes = np.stack([-1j * k2 * g3, 1j * k1 * g3, -1j * (k1 * g2 - k2 * g1)], axis=-1)
+        shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
+        root = np.sqrt(self.weights[:, None] * self._share / self.variance)
+        state = _State(
+            amplitude,
+            (modes - model) * root,
+            np.concatenate([slopes, shifts], axis=-1) * root[..., None],
+            self._square(modes) - float(right @ amplitude),
+        )
+        return normal, right, state
+
+    @staticmethod
+    def _shift_step(state: _State) -> tuple[Array, Array]:
+        """Return the shifts that reduce the misfit of the modes, and the inverse of their curvature."""
+        shifts = state.slopes[..., 3:]
+        curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
+        curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
+        inverse = np.linalg.inv(curvature)
+        gradient = np.einsum("gki,gk->gi", shifts.conj(), state.residual).real
+        return np.einsum("gij,gj->gi", inverse, gradient), inverse
+
+    def _search(
+        self, path: Path, low: LowBand, spline: Spline, hessian: Array, state: _State, values: Array
+    ) -> tuple[Array, float, Path]:
+        """Return the Newton step, shortened until it helps; its gain; the path it leads to."""
+        groups = len(values)
+        gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
+        downhill = (values.T @ gradient).ravel()
+        pinned = _pinned(hessian, path.R[-groups:], values)
+        step = np.linalg.solve(pinned, downhill).reshape(-1, 3)
+        for _ in range(6):
+            tried = path.bent(spline, step)
+            gain = state.cost - self.cost(tried.R[-groups:], low.modes)
+            if gain > 0:
+                return step, gain, tried
+            step = step / 4
+        return step, 0.0, path
+
+    def _hessian(self, R: Array, normal: Array, state: _State, values: Array) -> Array:
+        """Return half the Hessian by the spline's coefficients, object and shifts eliminated."""
+        curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
+        inverse = self._shift_step(state)[1]
+        carry = curvature[:, :3, 3:] @ inverse
+        own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
+        root = np.linalg.cholesky(inverse)
+        scale = self._blob * np.sqrt(self._share / self.variance)
+        coupling = np.zeros((len(normal), values.shape[1], 3))
+        reduced = normal.copy()
+        stack: list[Array] = []
+        for g, (rotation, slopes) in enumerate(zip(R, state.slopes, strict=True)):
+            wave = np.exp(1j * (self.position @ (rotation[:, :2] @ self.low.k.T)))
+            column = (wave @ (slopes * (scale * np.sqrt(self.weights[g]))[:, None])).real
+            near = np.flatnonzero(values[g])
+            turned = column[:, :3] - column[:, 3:] @ carry[g].T
+            coupling[:, near] += values[g, near][:, None] * turned[:, None, :]
+            stack.append(column[:, 3:] @ root[g])
+            if len(stack) == 256 or g == len(R) - 1:
+                shifts = np.concatenate(stack, axis=1)
+                reduced -= shifts @ shifts.T
+                stack = []
+        factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
+        flat = coupling.reshape(len(normal), -1)
+        half = scipy.linalg.solve_triangular(factor, flat, lower=True, overwrite_b=True, check_finite=False)
+        size = values.shape[1]
+        direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
+        return np.asarray(direct - half.T @ half)
+
+    def _finish(
+        self,
+        path: Path,
+        low: LowBand,
+        shift: Array,
+        spline: Spline,
+        normal: Array,
+        state: _State,
+        values: Array,
+    ) -> Fit:
+        """Judge the fit: degrees of freedom, covariance, misfit of each frame and mode."""
+        R = path.R[-len(values) :]
+        hessian = self._hessian(R, normal, state, values)
+        size = values.shape[1]
+        covariance = np.linalg.inv(_pinned(hessian, R, values)).reshape(size, 3, size, 3)
+        factor = scipy.linalg.cholesky(normal, lower=True, check_finite=False)
+        inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=True)
+        seen = len(normal) - float(np.trace(inverse))
+        degrees = max(self.data_count - seen - 3 * size + 3 - 2 * self.weights.sum(), 1.0)
+        # the centre of the blobs, not of the lattice, is the object's centre
+        middle = state.amplitude @ self.position / state.amplitude.sum()
+        power = np.abs(state.residual) ** 2
+        counts = self._share.sum() * np.maximum(self.weights, 1e-300)
+        correction = self.data_count / degrees
+        return Fit(
+            path=path,
+            low=low,
+            shift=shift + np.einsum("gji,j->gi", R, middle)[:, :2],
+            shift_errors=np.sqrt(np.diagonal(self._shift_step(state)[1], axis1=1, axis2=2)),
+            cost=state.cost,
+            degrees=degrees,
+            frame_misfit=power.sum(axis=1) / counts * correction,
+            ring_misfit=power.sum(axis=0) / (self._share * self.weights.sum()) * correction,
+            spline=spline,
+            covariance=covariance,
+        )
+
+
+@dataclass(frozen=True)
+class _State:
+    """The object for one motion; residual and slopes are whitened."""
+
+    amplitude: Array
+    residual: ComplexArray
+    slopes: ComplexArray
+    cost: float
+
+
+def _pinned(hessian: Array, R: Array, values: Array) -> Array:
+    """Return the Hessian with the free orientation of the object held."""
+    free = np.stack(
+        [np.linalg.lstsq(values, R[:, axis, :], rcond=None)[0].ravel() for axis in range(3)], axis=1
+    )
+    free, _ = np.linalg.qr(free)
+    scale = float(np.mean(np.diag(hessian)))
+    return np.asarray(hessian + _FIXED_GAUGE * scale * free @ free.T + 1e-12 * scale * np.eye(len(hessian)))
