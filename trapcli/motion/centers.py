@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from trapcli.motion.time_derivatives import choose_filters
 from trapcli.stack.frames import Frames
@@ -296,7 +296,7 @@ def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
 def _brightest(image: Array) -> Array:
     """Return roughly where the object is: the middle of what is bright after strong smoothing."""
     size = max(3, min(image.shape) // 16)
-    smooth = cv2.blur(image, (size, size))
+    smooth = uniform_filter(image, size)
     x1, x2 = _axes(image.shape)
     bright = smooth > 0.5 * smooth.max()
     moments: Array = np.array([bright.sum(axis=0) @ x1, bright.sum(axis=1) @ x2])

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from trapcli.config import InputConfig, PreprocessConfig
 from trapcli.errors import InputError
@@ -25,7 +26,7 @@ Background = Callable[[NDArray[Any]], NDArray[Any]]
 
 _SAMPLED = 64  # frames of a median
 _BORDER = 0.04  # width of the border, as a share of the shorter edge
-_GHOST = 0.1  # share of the object that a median may keep
+_GHOST = 0.25  # depth of what a median may keep, as a share of the object's
 _DARK_PIXELS = 0.01  # share of pixels without light beyond which a frame can't be judged
 
 
@@ -102,13 +103,16 @@ def _from_file(frames: Frames, path: str, roi: tuple[int, ...]) -> Array:
 
 
 def _sample(frames: Frames) -> Array:
-    """Return at most 64 frames spread over the stack, without those that are dark."""
+    """Return at most 64 frames spread over the stack, equally bright at the border, without dark ones."""
     wanted = np.unique(np.linspace(0, len(frames) - 1, min(_SAMPLED, len(frames))).round().astype(int))
     kept: list[NDArray[Any]] = []
     done = 0
     for block in frames.blocks():
         inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
-        kept.extend(image for image in np.asarray(block[inside], dtype=float) if (image > 0).mean() > 0.5)
+        for image in np.asarray(block[inside], dtype=float):
+            brightness = float(np.median(image[_border(image.shape)]))
+            if brightness > 0:
+                kept.append(image / brightness)
         done += len(block)
     if not kept:
         raise InputError(
@@ -119,12 +123,14 @@ def _sample(frames: Frames) -> Array:
 
 def _keeps_object(field: Array, sample: Array) -> bool:
     """Tell whether a median in time still shows the object, because that does not leave its place."""
-    ghost, images = (
-        np.abs(_minus_log(i, _border_surface(i, 2), np.dtype(float))) for i in (field[None], sample)
-    )
-    # what stands out of each image's own scatter, so that noise over the field does not count
-    mass = [float(np.nansum(np.where(a > 3 * np.nanmedian(a), a, 0.0))) for a in (*ghost, *images)]
-    return mass[0] > _GHOST * float(np.median(mass[1:]))
+
+    def depth(images: Array) -> float:
+        attenuation = np.abs(_minus_log(images, _border_surface(images, 2), np.dtype(float)))
+        # specks are small, an object is not
+        size = max(3, min(field.shape) // 12)
+        return float(np.median(uniform_filter(attenuation, (0, size, size)).max(axis=(1, 2))))
+
+    return depth(field[None]) > _GHOST * depth(sample)
 
 
 def _minus_log(block: NDArray[Any], background: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
@@ -136,7 +142,8 @@ def _minus_log(block: NDArray[Any], background: NDArray[Any], dtype: np.dtype[An
     known = np.isfinite(field) & (field > 0)
     ratio = np.divide(np.where(lit, light, step), field, out=np.ones_like(light), where=known)
     attenuation: NDArray[Any] = -np.log(ratio)
-    attenuation[(lit | ~known).mean(axis=(1, 2)) < 1 - _DARK_PIXELS] = np.nan
+    dark = (known & ~lit).mean(axis=(1, 2)) > _DARK_PIXELS
+    attenuation[dark | (known.mean(axis=(1, 2)) < 0.5)] = np.nan
     return attenuation
 
 
