@@ -57,11 +57,11 @@ def run(arguments: list[str] | None = None) -> None:
         say(str(error))
         code = error.exit_code
     except OSError as error:
-        # of stdout, since those of files are a TrapError; a reader like `head` may have what it wanted
+        # of stdout, as those of files are a TrapError; a reader like `head` may have what it wanted
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
         if not isinstance(error, BrokenPipeError):
-            say(f"standard output: can't be written ({error.strerror or error})")
+            say(f"{error.filename or 'standard output'}: can't be written ({error.strerror or error})")
             code = OutputError.exit_code
     except Exception as error:
         say(f"unexpected fault ({type(error).__name__}: {error}); please report it with what -vv shows")

@@ -176,7 +176,7 @@ def refuse_input(output: Path, *inputs: Path) -> None:
     from trapcli.errors import OutputError
 
     for path in inputs:
-        if output.exists() and path.exists() and output.samefile(path):
+        if os.path.exists(output) and os.path.exists(path) and output.samefile(path):
             raise OutputError(f"{output}: is an input; choose another name")
 
 

@@ -11,6 +11,7 @@ import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from typing import TypeVar
@@ -33,6 +34,7 @@ def in_processes(
     count:
         Processes at a time.
     """
+    resource_tracker.ensure_running()  # starting it later would let interrupts through again
     processes = _Processes(threads_each=max(1, (os.cpu_count() or 1) // count))
     with ThreadPoolExecutor(count, initializer=_block_interrupts) as executor:
         try:
@@ -91,6 +93,7 @@ class _Processes:
 
 def _serve(work: Callable[[Item], Result], item: Item, sender: Connection, threads: int) -> None:
     def interrupt(_signal: int, _frame: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
         raise KeyboardInterrupt
 
     try:
