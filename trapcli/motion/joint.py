@@ -32,7 +32,7 @@ Bools = NDArray[np.bool_]
 
 _FEWEST = 12  # frames
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the model's own errors dominate
-_LEAST_VISIBLE = 2e-3  # share of the peak at which the object ends
+_LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
 _LINE_BAND = 8.0  # band times radius for common lines
 _FINE_BAND = 12.0  # band times radius for the object model
 _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
@@ -51,7 +51,7 @@ _FITS = 1.5  # misfit per degree of freedom of lines and moments at which no oth
 _RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refined as well
 _KNOT_ANGLES = np.deg2rad((24.0, 12.0, 6.0))  # rotation per interval of the spline, coarse to fine
 _CERTIFIED = 1.08  # misfit per degree of freedom that pixel noise explains
-_MODEL_ERROR = 0.12  # misfit, as a share of what changes in the images, that an imperfect model may leave
+_MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
@@ -173,26 +173,25 @@ def _outliers(low: LowBand) -> Bools:
 def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float:
     """Return roughly the rotation from frame to frame [rad]; 0 where nothing changes.
 
-    Turning by θ in the image changes J̃ by θ ∂φJ̃, and turning out of it by about as much.
+    Turning by θ in the image changes J̃ by θ ∂φJ̃. Turning out of it may change much less of what is seen in one
+    frame; but what changes in all the stack changes over about a radian.
     """
     n, rings, lines = samples.shape
     turn = np.concatenate([samples, samples.conj()], axis=2)
     order = np.fft.fftfreq(2 * lines, 1 / (2 * lines))
     slope = np.fft.ifft(np.fft.fft(turn, axis=2) * (1j * order), axis=2)
     structure = float(np.mean(np.abs(slope) ** 2))
-    # noise of ∂φJ̃ by its own share of the spectrum: white along φ up to the band
-    independent = n * rings
-    lag, best = 1, 0.0
-    while lag <= max(1, n // 2):
-        change = float(np.mean(np.abs(samples[lag:] - samples[:-lag]) ** 2)) - 2 * noise**2
-        error = 2 * noise**2 / np.sqrt(max(independent / lag, 1.0))
-        if change > _SIGNIFICANT * error:
-            pace = np.sqrt(change / structure) / lag
-            if change > noise**2 or best:
-                return float(pace)
-            best = float(pace)
-        lag *= 2
-    return best
+    lags = [2**i for i in range(max(1, n.bit_length() - 1))]
+    change = np.array([np.mean(np.abs(samples[lag:] - samples[:-lag]) ** 2) - 2 * noise**2 for lag in lags])
+    error = np.array([2 * noise**2 / np.sqrt(max(n * rings / lag, 1.0)) for lag in lags])
+    significant = np.flatnonzero(change > _SIGNIFICANT * error)
+    if not len(significant):
+        return 0.0
+    clear = significant[change[significant] > noise**2]
+    first = clear[0] if len(clear) else significant[-1]
+    within = np.sqrt(change[first] / structure)
+    overall = np.sqrt(change[first] / change.max()) if len(clear) > 1 else 0.0
+    return float(max(within, overall) / lags[first])
 
 
 def _grouped(stack: _Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
