@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,11 +29,13 @@ _SURVEY = 32  # frames that the noise and the radius are measured on
 _RING = 2.0  # width of the rings of the radial profile [pixels]
 _VISIBLE = 0.06  # least power of a ring that counts as object, in units of the noise's
 _PLATEAU = 0.2  # power of the empty field beyond the noise's, in its units, that may be a misjudged noise
+_COARSE = 256  # pixels across on which the radius is measured
 _SIGNIFICANT = 5.0  # standard deviations
 _BLANK = 0.02  # share of the median mass below which a frame holds no object
 _CLIPPED = 0.01  # mean attenuation on one side of the frame, as a share of the frame's highest
 _OUTSIDE = 0.1  # share of the frame outside the object's disc that tells the level of the empty field
-_CONVERGED = 1e-9  # [pixels]
+_CONVERGED = 1e-9  # step that ends the iteration [pixels]
+_FINE = 0.01  # or in units of the error that the noise makes
 _MOST_STEPS = 50
 
 
@@ -160,6 +163,12 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
     noise:
         Standard deviation of the noise of one pixel.
     """
+    # a coarse look will do: pixels are averaged down to some 256 across
+    b = max(1, int(min(images.shape[1:])) // _COARSE)
+    if b > 1:
+        height, width = images.shape[1] // b * b, images.shape[2] // b * b
+        cells = images[:, :height, :width].reshape(-1, height // b, b, width // b, b).mean(axis=(2, 4))
+        return b * object_radius(np.asarray(cells), noise / b)
     radius = farthest = float(np.hypot(*images.shape[1:]))
     for _ in range(3):
         profiles = [_radial_profile(image, noise, radius) for image in images]
@@ -219,7 +228,7 @@ def _centroid(
 ) -> tuple[Array, float] | None:
     """Iterate the weighted centroid from a start; None where the mass does not stand out of the noise."""
     x1, x2 = _axes(image.shape)
-    mass = 0.0
+    mass, lever = 0.0, _lever(image.shape, radius)
     for _ in range(_MOST_STEPS):
         weights, rows, columns = disc(image.shape, center, radius)
         weighted = (image[rows, columns] - level) * weights
@@ -229,7 +238,7 @@ def _centroid(
         old = center
         moments = weighted.sum(axis=0) @ x1[columns], weighted.sum(axis=1) @ x2[rows]
         center = np.array(moments) / mass
-        if np.abs(center - old).max() < _CONVERGED:
+        if np.abs(center - old).max() < max(_CONVERGED, _FINE * noise * lever / mass):
             break
     return center, mass
 
@@ -250,7 +259,7 @@ def _radial_profile(image: NDArray[Any], noise: float, radius: float) -> Array:
 
 def _level(image: Array, noise: float, radius: float, center: Array) -> float:
     """Return the mean of the empty field, of what is like most of it: another particle does not count."""
-    stride = max(1, min(image.shape) // 256)
+    stride = max(1, min(image.shape) // _COARSE)
     x1, x2 = _axes(image.shape)
     r2 = (x2[::stride, None] - center[1]) ** 2 + (x1[::stride] - center[0]) ** 2
     outside = image[::stride, ::stride][r2 > (TAPER * radius) ** 2]
@@ -260,6 +269,7 @@ def _level(image: Array, noise: float, radius: float, center: Array) -> float:
     return float(outside[typical].mean())
 
 
+@lru_cache(maxsize=64)
 def _outside_share(shape: tuple[int, ...], radius: float) -> float:
     """Return the share of the frame that a disc about its middle leaves outside."""
     x1, x2 = _axes(shape)
@@ -303,6 +313,7 @@ def _brightest(image: Array) -> Array:
     return moments / max(float(bright.sum()), 1.0)
 
 
+@lru_cache(maxsize=64)
 def _lever(shape: tuple[int, ...], radius: float) -> float:
     """Return the error of the first moment for unit pixel noise: the root of the sum of squared distances."""
     weights, _, columns = disc(shape, np.zeros(2), radius)
