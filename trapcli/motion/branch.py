@@ -1,8 +1,8 @@
 """Find the motion without a starting value: common lines and moments, hypotheses, growing windows.
 
-Random constant angular velocities on a first window are refined to local minima of one noise-weighted objective; the
-best few distinct ones survive while the window grows over the whole stack and the spline that bends them gets more
-knots. A wrong branch that fits a short window does not fit a long one.
+Random constant angular velocities on a first window are refined to local minima of one noise-weighted
+objective; the best few distinct ones survive while the window grows over the whole stack and the spline that
+bends them gets more knots. A wrong branch that fits a short window does not fit a long one.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TAIL = 4  # steps whose mean carries a path on
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A path with its cost; `lines` and `moments` are the two parts per degree of freedom (1 fits the noise)."""
+    """A path with its cost; `lines` and `moments` are its parts per degree of freedom (1 fits the noise)."""
 
     path: Path
     cost: float
@@ -96,14 +96,14 @@ class Evidence:
         return best
 
     def _scale(self, pairs: int) -> float:
-        """Return what one pair counts: a frame has only so many independent lines, however many pairs share them."""
+        """Return what one pair counts: a frame has few independent lines, however many pairs share them."""
         return min(1.0, 0.5 * self.lines.reach * len(self.time) / pairs)
 
     def _normal_equations(self, path: Path, values: Array) -> tuple[Array, Array]:
         """Return Hessian and downhill gradient by the spline's coefficients."""
         s, t = self.pairs()
         lines = self.lines.residuals(path.R, s, t)
-        groups, size = values.shape
+        groups = len(values)
         scale = self._scale(len(s))
         bend = sparse.kron(sparse.csr_array(values), np.eye(3), format="csr")
         ends = np.stack([s, s, s, t, t, t], axis=1) * 3 + [0, 1, 2, 0, 1, 2]
@@ -111,7 +111,7 @@ class Evidence:
         coupled = sparse.coo_array(
             (scale * lines.hessian.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * groups, 3 * groups)
         ).tocsr()
-        gradient = np.bincount(ends.ravel(), scale * lines.gradient.ravel(), 3 * groups)
+        gradient = np.asarray(np.bincount(ends.ravel(), scale * lines.gradient.ravel(), 3 * groups), float)
         hessian = (bend.T @ (coupled @ bend)).toarray()
         for order in self.moments.residuals(path.R):
             gradient += order.gradient.ravel()

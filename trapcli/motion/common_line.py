@@ -159,7 +159,7 @@ class LineTable:
 
 
 def choose_pairs(groups: int, per_group: int, seed: int) -> tuple[Index, Index]:
-    """Return pairs (s, t), s + 2 ≤ t, of `groups` frames: all, or a random `per_group` a frame at all baselines."""
+    """Return pairs (s, t), s + 2 ≤ t, of `groups` frames: all, or a random `per_group` for each frame."""
     if groups * (groups - 3) // 2 <= per_group * groups:
         s, t = np.triu_indices(groups, 2)
         return s, t

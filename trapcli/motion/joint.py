@@ -1,8 +1,8 @@
 """The joint estimate from attenuation to motion: ``--method auto``.
 
-Common lines at all baselines and moments find the motion without a starting value (`branch`); a low-frequency model of
-the object, eliminated exactly, refines it and judges it (`object_model`). The misfit that remains, per degree of
-freedom, is 1 where pixel noise explains it: the certificate of the result.
+Common lines at all baselines and moments find the motion without a starting value (`branch`); a low-frequency
+model of the object, eliminated exactly, refines it and judges it (`object_model`). The misfit that remains,
+per degree of freedom, is 1 where pixel noise explains it: the certificate of the result.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def estimate_joint(
         Where fewer than 12 frames show an object.
     """
     centers = _estimate_centers(attenuation, pixel_size, progress)
-    seen = np.isfinite(centers.center).all(axis=1)
+    seen = np.asarray(np.isfinite(centers.center).all(axis=1))
     if seen.sum() < _FEWEST:
         raise InputError(
             f"{attenuation.info.source}: {seen.sum()} frames show an object; at least {_FEWEST} are needed"
@@ -173,8 +173,8 @@ def _outliers(low: LowBand) -> Bools:
 def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float:
     """Return roughly the rotation from frame to frame [rad]; 0 where nothing changes.
 
-    Turning by θ in the image changes J̃ by θ ∂φJ̃. Turning out of it may change much less of what is seen in one
-    frame; but what changes in all the stack changes over about a radian.
+    Turning by θ in the image changes J̃ by θ ∂φJ̃. Turning out of it may change much less of what is seen in
+    one frame; but what changes in all the stack changes over about a radian.
     """
     n, rings, lines = samples.shape
     turn = np.concatenate([samples, samples.conj()], axis=2)
@@ -299,8 +299,8 @@ def _judge(fit: Fit) -> _Verdict:
         )
     return _Verdict(
         False,
-        f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them is "
-        f"left over, {misfit:.1f} times the noise",
+        f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them "
+        f"is left over, {misfit:.1f} times the noise",
     )
 
 
@@ -367,7 +367,10 @@ def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
     text = verdict.text
     identifiable = verdict.identifiable and bool(valid.mean() > 0.5)
     if verdict.identifiable and not identifiable:
-        text = "the images leave the rotation open by more than 20 degrees: a symmetric object, too much noise or too little rotation"
+        text = (
+            "the images leave the rotation open by more than 20 degrees: "
+            "a symmetric object, too much noise or too little rotation"
+        )
 
     phi = np.where(judged & ~faint, np.arctan2(omega[:, 1], omega[:, 0]), np.nan)
     known = np.flatnonzero(np.isfinite(phi))
@@ -411,7 +414,7 @@ def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
 
 
 def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
-    """Return ``(N, 3, 3)`` covariances of R as rotation vectors in lab coordinates, R = 1 at the first frame."""
+    """Return ``(N, 3, 3)`` covariances of R as rotation vectors in the lab, R = 1 at the first frame."""
     # the first frame's error turns all others: ε(t) − R(t)ᵀ R(0) ε(0)
     back = np.swapaxes(R, 1, 2) @ R[0]
     own = np.einsum("nb,bicj,nc->nij", values, covariance, values, optimize=True)

@@ -1,12 +1,13 @@
 """What the frames hold at low spatial frequencies: Fourier modes on a square around the object, and moments.
 
-The joint estimate works on these alone. On the modes of a square that holds the object white pixel noise is white
-again, with a known variance; the frames themselves are not needed any more.
+The joint estimate works on these alone. On the modes of a square that holds the object white pixel noise is
+white again, with a known variance; the frames themselves are not needed any more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,8 @@ class LowBand:
     variance:
         ``E|noise|²`` of one mode.
     second, third:
-        ``(N, 3)`` and ``(N, 4)`` moments of order 2 and 3 about C₂ in units of the median mass and the radius:
-        x1², x1x2, x2² and x1³, x1²x2, x1x2², x2³.
+        ``(N, 3)`` and ``(N, 4)`` moments of order 2 and 3 about C₂ in units of the median mass and the
+        radius: x1², x1x2, x2² and x1³, x1²x2, x1x2², x2³.
     second_covariance, third_covariance:
         ``(3, 3)`` and ``(4, 4)``, from pixel noise.
     mass:
@@ -72,10 +73,8 @@ class LowBand:
         """Return means over groups of `size` consecutive frames; a last, shorter group is left out."""
         groups = len(self.time) // size
 
-        def mean(series: NDArray[np.generic]) -> NDArray[np.generic]:
-            return np.asarray(
-                series[: groups * size].reshape(groups, size, *series.shape[1:]).mean(axis=1)  # type: ignore[attr-defined]
-            )
+        def mean(series: NDArray[Any]) -> NDArray[Any]:
+            return np.asarray(series[: groups * size].reshape(groups, size, *series.shape[1:]).mean(axis=1))
 
         return replace(
             self,
@@ -114,14 +113,14 @@ def read_low_band(
     time:
         ``(N,)`` times.
     band:
-        Highest \\|k\\| [rad / length].
+        Highest length of k [rad / length].
     pixel_size:
         Edge of a pixel [length].
     progress:
         Called as ``progress("low band", done, N)``.
     """
     half = int(np.ceil(SQUARE * centers.radius / pixel_size))
-    offset = (np.arange(2 * half) - half) * pixel_size
+    offset = np.arange(-half, half, dtype=np.float64) * pixel_size
     edge = 2 * half * pixel_size
     frequency = (
         2 * np.pi / edge * np.arange(-int(band * edge / (2 * np.pi)), int(band * edge / (2 * np.pi)) + 1)

@@ -1,15 +1,17 @@
 """Moments of the images as polynomials in R (Helgason–Ludwig consistency).
 
 The moment of order n of a projection about its centre is a component of the object's moment tensor in lab
-coordinates: ``M_ab(t) = Σ R_ia R_jb M_ij``, a, b ∈ {1, 2}. The tensors, 6 numbers for n = 2 and 10 for n = 3, are
-unknown, enter linearly and are eliminated. Unlike common lines, moments see α where all viewing directions lie on
-one great circle. Source: Basu and Bresler 2000, DOI 10.1109/83.846251 (unknown view angles).
+coordinates: ``M_ab(t) = Σ R_ia R_jb M_ij``, a, b ∈ {1, 2}. The tensors, 6 numbers for n = 2 and 10 for n = 3,
+are unknown, enter linearly and are eliminated. Unlike common lines, moments see α where all viewing
+directions lie on one great circle. Source: Basu and Bresler 2000, DOI 10.1109/83.846251 (unknown view
+angles).
 """
 
 from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +58,8 @@ class MomentTable:
     low:
         The frames' low-frequency content.
     model_error:
-        Error of the moments besides pixel noise, as a share of their size: mass, background and centring that drift.
+        Error of the moments besides pixel noise, as a share of their size: mass, background and centring that
+        drift.
     """
 
     def __init__(self, low: LowBand, model_error: float) -> None:
@@ -116,15 +119,19 @@ class _Order:
 
     def design(self, lab: Array) -> Array:
         """Return the whitened ``(G, C, U)`` components seen in the images."""
-        seen = np.stack([lab[(slice(None), slice(None), *c)] for c in self.components], axis=1)
-        return np.asarray(self.whitening @ seen)
+        return np.asarray(self.whitening @ np.swapaxes(self._seen(lab), 1, 2))
+
+    def _seen(self, tensors: Array) -> Array:
+        """Return the ``(..., C)`` components that the images show of ``(..., 3, 3[, 3])`` tensors."""
+        places: tuple[Any, ...] = (..., *np.transpose(self.components))
+        return np.asarray(tensors[places])
 
     def eliminate(self, design: Array) -> tuple[Array, Array, float, Array]:
         """Return the tensor, the residuals ``(G, C)``, their square and the normal matrix."""
         flat = design.reshape(-1, design.shape[-1])
         normal = flat.T @ flat
         normal += 1e-12 * np.trace(normal) * np.eye(len(normal))
-        tensor = np.linalg.solve(normal, flat.T @ self.values.ravel())
+        tensor = np.asarray(np.linalg.solve(normal, flat.T @ self.values.ravel()), float)
         residual = self.values - design @ tensor
         return tensor, residual, float(np.sum(residual**2)), normal
 
@@ -138,8 +145,7 @@ class _Order:
         for axis in range(1, whole.ndim):
             turned = -np.einsum("eab,g...b->eg...a", _GENERATORS, np.moveaxis(whole, axis, -1))
             change += np.moveaxis(turned, -1, axis + 1)
-        seen = np.stack([change[(slice(None), slice(None), *c)] for c in self.components], axis=-1)
-        slopes = np.einsum("cd,egd->gce", self.whitening, seen)
+        slopes = np.einsum("cd,egd->gce", self.whitening, self._seen(change))
         gradient = np.einsum("gce,gc->ge", slopes, residual)
         degrees = float(self.values.size - len(self.basis))
         return MomentResiduals(cost, degrees, gradient, slopes, design, normal)

@@ -1,9 +1,10 @@
 """A low-frequency model of the object, eliminated exactly: the likelihood of a motion.
 
-The object is a sum of Gaussian blobs on a cubic lattice; their amplitudes enter the frames' low-frequency modes
-linearly and are solved for at every motion (variable projection; Golub and Pereyra 2003, DOI
-10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's shift is eliminated with
-them, so that centring costs nothing. All sums over frames are non-uniform Fourier transforms on the lattice.
+The object is a sum of Gaussian blobs on a cubic lattice; their amplitudes enter the frames' low-frequency
+modes linearly and are solved for at every motion (variable projection; Golub and Pereyra 2003, DOI
+10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's shift is eliminated
+with them, so that centring costs nothing. All sums over frames are non-uniform Fourier transforms on the
+lattice.
 """
 
 from __future__ import annotations
@@ -141,13 +142,12 @@ class ObjectModel:
         hessian: Array | None = None
         old = np.inf
         for _ in range(steps):
-            normal, right, state = self._state(path.R[-groups:], low.modes)
-            moved = self._shift_step(state)[0]
+            moved = self._shift_step(self._state(path.R[-groups:], low.modes)[1])[0]
             shift, low = shift + moved, low.shifted(moved)
-            normal, right, state = self._state(path.R[-groups:], low.modes)
+            normal, state = self._state(path.R[-groups:], low.modes)
             if hessian is None:
                 hessian = self._hessian(path.R[-groups:], normal, state, values)
-            step, gain, tried = self._search(path, low, spline, hessian, state, values)
+            gain, tried = self._search(path, low, spline, hessian, state, values)
             if not gain > 0:
                 break
             path = tried
@@ -157,7 +157,7 @@ class ObjectModel:
                 break
             if slow:
                 hessian = None
-        normal, right, state = self._state(path.R[-groups:], low.modes)
+        normal, state = self._state(path.R[-groups:], low.modes)
         return self._finish(path, low, shift, spline, normal, state, values)
 
     # ------------------------------------------------------------------ one motion
@@ -183,8 +183,8 @@ class ObjectModel:
         normal[np.diag_indices(len(normal))] += 1.0
         return normal, np.asarray(right.real[self._mask])
 
-    def _state(self, R: Array, modes: ComplexArray) -> tuple[Array, Array, _State]:
-        """Solve for the object; return its normal equations and what the gradient needs."""
+    def _state(self, R: Array, modes: ComplexArray) -> tuple[Array, _State]:
+        """Solve for the object; return its normal matrix and what the gradient needs."""
         normal, right = self._normal(R, modes)
         factor = scipy.linalg.cho_factor(normal, lower=True, check_finite=False)
         amplitude = scipy.linalg.cho_solve(factor, right, check_finite=False)
@@ -207,7 +207,7 @@ class ObjectModel:
             np.concatenate([slopes, shifts], axis=-1) * root[..., None],
             self._square(modes) - float(right @ amplitude),
         )
-        return normal, right, state
+        return normal, state
 
     @staticmethod
     def _shift_step(state: _State) -> tuple[Array, Array]:
@@ -221,8 +221,8 @@ class ObjectModel:
 
     def _search(
         self, path: Path, low: LowBand, spline: Spline, hessian: Array, state: _State, values: Array
-    ) -> tuple[Array, float, Path]:
-        """Return the Newton step, shortened until it helps; its gain; the path it leads to."""
+    ) -> tuple[float, Path]:
+        """Return the gain of the Newton step, shortened until it helps, and the path it leads to."""
         groups = len(values)
         gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
         downhill = (values.T @ gradient).ravel()
@@ -232,9 +232,9 @@ class ObjectModel:
             tried = path.bent(spline, step)
             gain = state.cost - self.cost(tried.R[-groups:], low.modes)
             if gain > 0:
-                return step, gain, tried
+                return gain, tried
             step = step / 4
-        return step, 0.0, path
+        return 0.0, path
 
     def _hessian(self, R: Array, normal: Array, state: _State, values: Array) -> Array:
         """Return half the Hessian by the spline's coefficients, object and shifts eliminated."""
@@ -279,7 +279,7 @@ class ObjectModel:
         R = path.R[-len(values) :]
         hessian = self._hessian(R, normal, state, values)
         size = values.shape[1]
-        covariance = np.linalg.inv(_pinned(hessian, R, values)).reshape(size, 3, size, 3)
+        covariance = np.asarray(np.linalg.inv(_pinned(hessian, R, values)), float)
         factor = scipy.linalg.cholesky(normal, lower=True, check_finite=False)
         inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=True)
         seen = len(normal) - float(np.trace(inverse))
@@ -299,7 +299,7 @@ class ObjectModel:
             frame_misfit=power.sum(axis=1) / counts * correction,
             ring_misfit=power.sum(axis=0) / (self._share * self.weights.sum()) * correction,
             spline=spline,
-            covariance=covariance,
+            covariance=covariance.reshape(size, 3, size, 3),
         )
 
 

@@ -1,8 +1,8 @@
 """A smooth path R(t) on SO(3) and the cubic splines by which it is bent.
 
-The path is bent by small rotations in lab coordinates, ``R(t) → R(t) exp([δ(t)]×)``, with δ a cubic spline. A spline
-coefficient moves a few knots' worth of the path and nothing else, so that normal equations stay local; ω follows
-exactly, ``ω → exp(−[δ]×) ω + J_r(δ) δ'``, with the right Jacobian J_r of SO(3).
+The path is bent by small rotations in lab coordinates, ``R(t) → R(t) exp([δ(t)]×)``, with δ a cubic spline. A
+spline coefficient moves a few knots' worth of the path and nothing else, so that normal equations stay local;
+ω follows exactly, ``ω → exp(−[δ]×) ω + J_r(δ) δ'``, with the right Jacobian J_r of SO(3).
 """
 
 from __future__ import annotations
