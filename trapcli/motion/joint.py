@@ -19,7 +19,7 @@ from trapcli.motion.centers import Centers, Progress, estimate_centers, object_r
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.low_band import LowBand, read_low_band
 from trapcli.motion.moments import MomentTable
-from trapcli.motion.object_model import Fit, ObjectModel
+from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Path, Spline
 from trapcli.motion.reduced_map import reduce_frames
 from trapcli.motion.translation import translation
@@ -34,7 +34,8 @@ _FEWEST = 12  # frames
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the model's own errors dominate
 _LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
 _LINE_BAND = 8.0  # band times radius for common lines
-_FINE_BAND = 12.0  # band times radius for the object model
+_COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
+_FINE_BAND = 16.0  # band times radius of the object model in the end
 _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
 _FINE_GROUP = np.deg2rad(1.0)  # the same, to refine it, at noise of 1 % of the peak
 _FEWEST_GROUPS = 30
@@ -118,8 +119,8 @@ def estimate_joint(
         )
     hypotheses = _hypotheses(stack, used, pace, progress)
     fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in hypotheses]
-    fit = min(fits, key=lambda f: f.cost)
-    return _motion(stack, fit, _judge(fit))
+    fit, assessment = min(fits, key=lambda refined: refined[0].cost)
+    return _motion(stack, fit, assessment, _judge(fit, assessment), pixel_size)
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ def _hypotheses(
 
 def _refine(
     stack: _Stack, used: NDArray[np.intp], hypothesis: Hypothesis, pace: float, band: float, knots: int
-) -> Fit:
+) -> tuple[Fit, Assessment]:
     """Fit the object model along a hypothesis, with as many knots as the data pay for."""
     fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
     size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
@@ -232,6 +233,7 @@ def _refine(
     time = stack.low.time
     turned = float(np.linalg.norm(hypothesis.path.mean_omega(), axis=1).mean() * np.ptp(low.time))
     intervals = [knots] if knots else [max(4, round(turned / angle)) for angle in _KNOT_ANGLES]
+    coarse = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
     best: Fit | None = None
     for count in intervals:
         if best is not None and 3 * count > len(low.time):
@@ -240,18 +242,19 @@ def _refine(
         if best is None:
             path = _resampled(hypothesis.path, spline, np.concatenate([time, low.time]))
         else:
-            path, low = best.path, replace(low, k=best.low.k, modes=best.low.modes)
-        fit = ObjectModel(low, band).fit(path, low.time, spline)
-        if best is not None:
-            fit = replace(fit, shift=fit.shift + best.shift)
-            # Akaike: a parameter must lower the misfit by 2
-            if best.cost - fit.cost < 2 * 3 * (fit.spline.size - best.spline.size):
-                break
+            path = best.path
+        fit = coarse.fit(path, low.time, spline)
+        # Akaike: a parameter must lower the misfit by 2
+        if best is not None and best.cost - fit.cost < 2 * 3 * (fit.spline.size - best.spline.size):
+            break
         best = fit
     assert best is not None
-    if best.cost / best.degrees > _CERTIFIED:
-        return _with_model_error(best, band)
-    return best
+    model = ObjectModel(low, band)
+    fit = model.fit(best.path, low.time, best.spline)
+    assessment = model.assess(fit)
+    if fit.cost / assessment.degrees > _CERTIFIED:
+        return _with_model_error(fit, assessment, band)
+    return fit, assessment
 
 
 def _relative_noise(stack: _Stack) -> float:
@@ -260,18 +263,14 @@ def _relative_noise(stack: _Stack) -> float:
     return float(stack.centers.noise * area / np.nanmedian(stack.low.mass)) / 3
 
 
-def _with_model_error(fit: Fit, band: float) -> Fit:
+def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fit, Assessment]:
     """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
-    variance = fit.low.variance * np.maximum(fit.ring_misfit, 1.0)
-    again = ObjectModel(fit.low, band, variance=variance).fit(fit.path, fit.low.time, fit.spline)
-    excess = np.maximum(fit.ring_misfit, 1.0)
-    return replace(
-        again,
-        shift=again.shift + fit.shift,
-        ring_misfit=again.ring_misfit * excess,
-        cost=fit.cost,
-        degrees=fit.degrees,
-    )
+    excess = np.maximum(assessment.mode_misfit, 1.0)
+    model = ObjectModel(fit.low, band, variance=fit.low.variance * excess)
+    again = model.fit(fit.path, fit.low.time, fit.spline)
+    honest = model.assess(again)
+    again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
+    return again, replace(honest, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess)
 
 
 def _resampled(path: Path, spline: Spline, times: Array) -> Path:
@@ -282,14 +281,14 @@ def _resampled(path: Path, spline: Spline, times: Array) -> Path:
     return Path(times, smooth.R[back], smooth.omega[back])
 
 
-def _judge(fit: Fit) -> _Verdict:
+def _judge(fit: Fit, assessment: Assessment) -> _Verdict:
     """Say whether the misfit is what the noise leaves, or what else it is."""
-    misfit = fit.cost / fit.degrees
+    misfit = fit.cost / assessment.degrees
     if misfit <= _CERTIFIED:
         return _Verdict(True, f"the motion explains the images: misfit {misfit:.3f} of what the noise gives")
     changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
     share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
-    left = float(np.sum(share * np.maximum(fit.ring_misfit - 1, 0.0)) * fit.low.variance)
+    left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
     error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
     if error <= _MODEL_ERROR:
         return _Verdict(
@@ -341,15 +340,15 @@ def _flags(stack: _Stack) -> NDArray[np.uint16]:
     return flags
 
 
-def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
+def _motion(stack: _Stack, fit: Fit, assessment: Assessment, verdict: _Verdict, pixel_size: float) -> Motion:
     """Put the fitted path into the gauge of the result, with errors and flags."""
     time = stack.low.time
     n = len(time)
     R, omega = fit.path.R[:n], fit.path.omega[:n]
     R = R[0].T @ R
     values, slopes = fit.spline.values(time), fit.spline.slopes(time)
-    R_covariance = _rotation_covariance(R, values, fit.covariance)
-    omega_covariance = _omega_covariance(omega, values, slopes, fit.covariance)
+    R_covariance = _rotation_covariance(R, values, assessment.covariance)
+    omega_covariance = _omega_covariance(omega, values, slopes, assessment.covariance)
     alpha = np.hypot(omega[:, 0], omega[:, 1])
     v = omega[:, :2] / np.maximum(alpha, 1e-300)[:, None]
     across = np.stack([-v[:, 1], v[:, 0]], axis=1)
@@ -384,11 +383,9 @@ def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
             R = sigma @ R @ sigma
         phi = phi - half_turns * np.pi
     unknown = ~judged
-    shift = np.stack([np.interp(time, fit.low.time, s) for s in fit.shift.T], axis=1)
-    shift_errors = np.stack([np.interp(time, fit.low.time, s) for s in fit.shift_errors.T], axis=1)
-    center = stack.centers.center + shift
+    center, center_errors = _centers(stack, fit, assessment, pixel_size)
     size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
-    residual = np.interp(time, fit.low.time, np.sqrt(fit.frame_misfit * fit.low.variance)) / size
+    residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
     R_errors[unknown] = np.nan
     R = np.where(unknown[:, None, None], np.nan, R)
     return Motion(
@@ -400,7 +397,7 @@ def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
         omega_3=np.where(unknown, np.nan, omega[:, 2]),
         alpha=np.where(unknown, np.nan, alpha),
         R=R,
-        T_errors=np.hypot(shift_errors, shift_errors[0]),
+        T_errors=np.hypot(center_errors, center_errors[0]),
         phi_errors=np.where(np.isfinite(phi), sideways / np.maximum(alpha, 1e-300), np.nan),
         omega_3_errors=np.where(unknown, np.nan, np.sqrt(omega_covariance[:, 2, 2])),
         alpha_errors=np.where(unknown, np.nan, alpha_errors),
@@ -411,6 +408,22 @@ def _motion(stack: _Stack, fit: Fit, verdict: _Verdict) -> Motion:
         identifiable=identifiable,
         verdict=text,
     )
+
+
+def _centers(stack: _Stack, fit: Fit, assessment: Assessment, pixel_size: float) -> tuple[Array, Array]:
+    """Return the centres C₂ as the object model sees them, and their errors."""
+    groups = len(fit.low.time)
+    own = fit.shift + np.einsum("gji,j->gi", fit.path.R[-groups:], assessment.middle)[:, :2]
+    # where the object's own centre lies is known as well as the mean centroid of all frames
+    lever = np.sqrt(np.pi / 4) * stack.low.radius**2 * pixel_size * stack.centers.noise
+    common = lever / float(np.nanmedian(stack.low.mass)) / np.sqrt(max(stack.seen.sum(), 1))
+    errors = np.hypot(assessment.shift_errors, common)
+
+    def at_frames(series: Array) -> Array:
+        columns = [np.interp(stack.low.time, fit.low.time, column) for column in series.T]
+        return np.stack(columns, axis=1)
+
+    return stack.centers.center + at_frames(own), at_frames(errors)
 
 
 def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:

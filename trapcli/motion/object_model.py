@@ -30,6 +30,7 @@ _MARGIN = 0.3  # lattice beyond the object's radius, in spacings
 _PRECISION = 1e-13  # of the transforms: the normal matrix spans ten orders of magnitude
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 6
+_CONVERGED = 0.5  # gain in misfit, against an expected change of 1, that ends the search
 
 
 @dataclass(frozen=True)
@@ -39,33 +40,48 @@ class Fit:
     Attributes
     ----------
     path:
-        R and ω at the times that were asked for.
+        R and ω at the times that were asked for, followed by the G group times.
     low:
         The data, centred as the model wants them.
     shift:
         ``(G, 2)`` by how much the centres moved [length].
-    shift_errors:
-        ``(G, 2)`` [length].
-    cost, degrees:
-        Misfit and its expectation, ``cost / degrees`` is 1 where the noise explains it.
-    frame_misfit:
-        ``(G,)`` misfit of each frame per mode.
-    ring_misfit:
-        ``(K,)`` misfit of each mode.
-    spline, covariance:
-        The last spline and the ``(size, 3, size, 3)`` covariance of its coefficients.
+    spline:
+        What bent the path.
+    cost:
+        Misfit to the data.
     """
 
     path: Path
     low: LowBand
     shift: Array
-    shift_errors: Array
-    cost: float
-    degrees: float
-    frame_misfit: Array
-    ring_misfit: Array
     spline: Spline
+    cost: float
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """How well a fit fits and how far it can be trusted.
+
+    Attributes
+    ----------
+    degrees:
+        Expected misfit: ``fit.cost / degrees`` is 1 where the noise explains it.
+    covariance:
+        ``(size, 3, size, 3)`` covariance of the spline's coefficients.
+    frame_misfit, mode_misfit:
+        ``(G,)`` and ``(K,)`` misfit of each frame and of each mode in units of its noise.
+    middle:
+        ``(3,)`` centre of the object from the origin of the model, in object coordinates [length].
+    shift_errors:
+        ``(G, 2)`` 1-σ errors of the shifts for a known object [length].
+    """
+
+    degrees: float
     covariance: Array
+    frame_misfit: Array
+    mode_misfit: Array
+    middle: Array
+    shift_errors: Array
 
 
 class ObjectModel:
@@ -147,18 +163,35 @@ class ObjectModel:
             normal, state = self._state(path.R[-groups:], low.modes)
             if hessian is None:
                 hessian = self._hessian(path.R[-groups:], normal, state, values)
-            gain, tried = self._search(path, low, spline, hessian, state, values)
-            if not gain > 0:
+            gain, path = self._search(path, low, spline, hessian, state, values)
+            if gain < _CONVERGED:
                 break
-            path = tried
-            slow = gain > 0.3 * old
-            old = gain
-            if gain < 0.5:
-                break
-            if slow:
+            if gain > 0.3 * old:
                 hessian = None
-        normal, state = self._state(path.R[-groups:], low.modes)
-        return self._finish(path, low, shift, spline, normal, state, values)
+            old = gain
+        return Fit(path, low, shift, spline, self.cost(path.R[-groups:], low.modes))
+
+    def assess(self, fit: Fit) -> Assessment:
+        """Return degrees of freedom, covariance and the misfit of each frame and mode of a fit."""
+        values = fit.spline.values(fit.low.time)
+        R = fit.path.R[-len(values) :]
+        normal, state = self._state(R, fit.low.modes)
+        hessian = self._hessian(R, normal, state, values)
+        size = values.shape[1]
+        covariance = np.asarray(np.linalg.inv(_pinned(hessian, R, values)), float)
+        factor = scipy.linalg.cholesky(normal, lower=True, check_finite=False)
+        inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=True)
+        seen = len(normal) - float(np.trace(inverse))
+        degrees = max(self.data_count - seen - 3 * size + 3 - 2 * self.weights.sum(), 1.0)
+        power = np.abs(state.residual) ** 2 * self.data_count / degrees
+        return Assessment(
+            degrees=degrees,
+            covariance=covariance.reshape(size, 3, size, 3),
+            frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
+            mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
+            middle=state.amplitude @ self.position / state.amplitude.sum(),
+            shift_errors=np.sqrt(np.diagonal(self._shift_step(state)[1], axis1=1, axis2=2)),
+        )
 
     # ------------------------------------------------------------------ one motion
 
@@ -244,63 +277,33 @@ class ObjectModel:
         own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
         root = np.linalg.cholesky(inverse)
         scale = self._blob * np.sqrt(self._share / self.variance)
-        coupling = np.zeros((len(normal), values.shape[1], 3))
+        size = values.shape[1]
+        coupling = np.zeros((size, len(normal), 3))
         reduced = normal.copy()
         stack: list[Array] = []
         for g, (rotation, slopes) in enumerate(zip(R, state.slopes, strict=True)):
-            wave = np.exp(1j * (self.position @ (rotation[:, :2] @ self.low.k.T)))
-            column = (wave @ (slopes * (scale * np.sqrt(self.weights[g]))[:, None])).real
-            near = np.flatnonzero(values[g])
+            column = self._back_projected(rotation, slopes * (scale * np.sqrt(self.weights[g]))[:, None])
             turned = column[:, :3] - column[:, 3:] @ carry[g].T
-            coupling[:, near] += values[g, near][:, None] * turned[:, None, :]
+            for b in np.flatnonzero(values[g]):
+                coupling[b] += values[g, b] * turned
             stack.append(column[:, 3:] @ root[g])
             if len(stack) == 256 or g == len(R) - 1:
                 shifts = np.concatenate(stack, axis=1)
                 reduced -= shifts @ shifts.T
                 stack = []
         factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
-        flat = coupling.reshape(len(normal), -1)
+        flat = coupling.transpose(1, 0, 2).reshape(len(normal), -1)
         half = scipy.linalg.solve_triangular(factor, flat, lower=True, overwrite_b=True, check_finite=False)
-        size = values.shape[1]
         direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
         return np.asarray(direct - half.T @ half)
 
-    def _finish(
-        self,
-        path: Path,
-        low: LowBand,
-        shift: Array,
-        spline: Spline,
-        normal: Array,
-        state: _State,
-        values: Array,
-    ) -> Fit:
-        """Judge the fit: degrees of freedom, covariance, misfit of each frame and mode."""
-        R = path.R[-len(values) :]
-        hessian = self._hessian(R, normal, state, values)
-        size = values.shape[1]
-        covariance = np.asarray(np.linalg.inv(_pinned(hessian, R, values)), float)
-        factor = scipy.linalg.cholesky(normal, lower=True, check_finite=False)
-        inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=True)
-        seen = len(normal) - float(np.trace(inverse))
-        degrees = max(self.data_count - seen - 3 * size + 3 - 2 * self.weights.sum(), 1.0)
-        # the centre of the blobs, not of the lattice, is the object's centre
-        middle = state.amplitude @ self.position / state.amplitude.sum()
-        power = np.abs(state.residual) ** 2
-        counts = self._share.sum() * np.maximum(self.weights, 1e-300)
-        correction = self.data_count / degrees
-        return Fit(
-            path=path,
-            low=low,
-            shift=shift + np.einsum("gji,j->gi", R, middle)[:, :2],
-            shift_errors=np.sqrt(np.diagonal(self._shift_step(state)[1], axis1=1, axis2=2)),
-            cost=state.cost,
-            degrees=degrees,
-            frame_misfit=power.sum(axis=1) / counts * correction,
-            ring_misfit=power.sum(axis=0) / (self._share * self.weights.sum()) * correction,
-            spline=spline,
-            covariance=covariance.reshape(size, 3, size, 3),
-        )
+    def _back_projected(self, rotation: Array, modes: ComplexArray) -> Array:
+        """Return ``Re Σ_k exp(i⟨R k, b⟩) modes`` at the lattice points b, ``(n, C)`` for ``(K, C)`` modes."""
+        # the lattice is symmetric, point n − 1 − i being the mirror image of point i
+        above = len(self.position) // 2 + 1
+        phase = self.position[:above] @ (rotation[:, :2] @ self.low.k.T)
+        even, odd = np.cos(phase) @ modes.real, np.sin(phase) @ modes.imag
+        return np.concatenate([even - odd, (even + odd)[-2::-1]])
 
 
 @dataclass(frozen=True)
