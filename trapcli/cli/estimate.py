@@ -317,7 +317,7 @@ def _outcome(job: Job, motion: Motion, warnings: tuple[str, ...]) -> Outcome:
     }
     if motion.identifiable and valid.any():
         return Outcome(DONE, summary=summary, warnings=warnings)
-    message = f"{job.source}: not trustworthy: {motion.verdict}"
+    message = f"{job.source}: not trustworthy: {motion.verdict.removeprefix('not trustworthy: ')}"
     return Outcome(NOT_TRUSTWORTHY, message, summary, warnings)
 
 

@@ -43,6 +43,8 @@ def cli() -> None:
 def run(arguments: list[str] | None = None) -> None:
     """Entry point of ``trap-motion``: run a command, map every failure to the exit codes of the contract."""
     signal.signal(signal.SIGTERM, _terminate)
+    # our matrices are small and many: threads that share one spend most of their time waiting for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code: Any = cli.main(args=arguments, prog_name="trap-motion", standalone_mode=False)
         if sys.stdout:
