@@ -58,13 +58,13 @@ def run(arguments: list[str] | None = None) -> None:
     except TrapError as error:
         say(str(error))
         code = error.exit_code
+    except SystemExit:
+        code = 0  # click's answer to a reader like `head`, which has what it wanted
     except OSError as error:
-        # of stdout, as those of files are a TrapError; a reader like `head` may have what it wanted
+        # of stdout, as those of files are a TrapError
+        say(f"{error.filename or 'standard output'}: can't be written ({error.strerror or error})")
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        code = 0
-        if not isinstance(error, BrokenPipeError):
-            say(f"{error.filename or 'standard output'}: can't be written ({error.strerror or error})")
-            code = OutputError.exit_code
+        code = OutputError.exit_code
     except Exception as error:
         say(f"unexpected fault ({type(error).__name__}: {error}); please report it with what -vv shows")
         code = FAULT
