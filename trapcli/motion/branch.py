@@ -16,7 +16,7 @@ from scipy import sparse
 
 from trapcli.motion.common_line import LineTable, choose_pairs
 from trapcli.motion.moments import MomentTable
-from trapcli.motion.path import Path, Spline, align
+from trapcli.motion.path import Path, Spline, align, orthonormal
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -192,7 +192,7 @@ def _refine_ends(evidence: Evidence, path: Path, groups_per_knot: int) -> Path:
         bent = end.refine(piece, _spline(end.time, groups_per_knot), 8).path
         R, omega = path.R.copy(), path.omega.copy()
         # the object's orientation is free in each refinement: join where the window meets the rest
-        R[window] = (path.R[window][joint] @ bent.R[joint].T) @ bent.R
+        R[window] = orthonormal((path.R[window][joint] @ bent.R[joint].T) @ bent.R)
         omega[window] = bent.omega
         path = Path(path.time, R, omega)
     return path

@@ -93,7 +93,7 @@ class Path:
         delta, slope = spline.values(self.time) @ coefficients, spline.slopes(self.time) @ coefficients
         turn = Rotation.from_rotvec(delta)
         omega = turn.inv().apply(self.omega) + np.einsum("nij,nj->ni", _right_jacobian(delta), slope)
-        return Path(self.time, self.R @ turn.as_matrix(), omega)
+        return Path(self.time, orthonormal(self.R @ turn.as_matrix()), omega)
 
     def mean_omega(self) -> Array:
         """Return the ``(N−1, 3)`` constant angular velocities that lead from each time to the next."""
@@ -113,6 +113,11 @@ class Path:
         R = np.concatenate([self.R[0] @ head, self.R, self.R[-1] @ rest])
         omega = np.concatenate([np.tile(before, (len(head), 1)), self.omega, np.tile(after, (len(rest), 1))])
         return Path(time, R, omega)
+
+
+def orthonormal(R: Array) -> Array:
+    """Return ``(N, 3, 3)`` rotations after one Newton step back to SO(3), for rounding that accumulates."""
+    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, 1, 2) @ R))
 
 
 def cross_matrix(v: Array) -> Array:
