@@ -3,6 +3,10 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+TRAP   := ../$(BIN)/trap-motion
+
+# the tests' matrices are small, and several processes run at once
+export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test slow lint setup bench clean
 
@@ -12,6 +16,18 @@ $(STAMP): pyproject.toml
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint]'
 	@touch $@
+
+# the paper's example: a stack with its true motion, both methods, errors and figures
+demo: $(STAMP)
+	@rm -rf demo && mkdir demo
+	cd demo && $(TRAP) simulate
+	cd demo && $(TRAP) estimate sim.tif --attenuation --method paper -o paper.h5
+	cd demo && $(TRAP) compare paper.h5 truth.h5
+	cd demo && $(TRAP) plot paper.h5 --truth truth.h5 --stack sim.tif
+	cd demo && $(TRAP) estimate sim.tif --attenuation -o auto.h5
+	cd demo && $(TRAP) compare auto.h5 truth.h5
+	cd demo && $(TRAP) plot auto.h5 --truth truth.h5 --stack sim.tif
+	@echo "Done: look at demo/paper.png and demo/auto.png."
 
 test: $(STAMP)
 	$(BIN)/python -m pytest -m "not slow" -n 2
@@ -23,6 +39,10 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# the table of docs/benchmarks-paper.md
+bench: $(STAMP)
+	$(BIN)/python benchmarks/paper_table.py
 
 clean:
 	rm -rf demo $(VENV) build *.egg-info

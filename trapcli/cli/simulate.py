@@ -91,7 +91,7 @@ def command(
     console: Console,
     **options: Any,
 ) -> None:
-    r"""Render a stack and its true motion.
+    """Render a stack and its true motion.
 
     Without options: the paper's object and motion in 200 frames of 128 x 128, as sim.tif and truth.h5.
 
@@ -103,7 +103,7 @@ def command(
       camera       the same grain as raw 12-bit images
 
     The written paths go to stdout. configs/simulate-*.toml explain all settings for --config.
-    """
+    """  # noqa: D301
     if preset and config:
         raise ConfigError("--preset and --config exclude each other; copy the preset's file and change that")
     paths = _outputs(output, truth, background_out, overwrite)
