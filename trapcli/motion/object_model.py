@@ -10,6 +10,7 @@ lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import finufft
 import numpy as np
@@ -30,6 +31,8 @@ _MARGIN = 0.3  # lattice beyond the object's radius, in spacings
 _PRECISION = 1e-13  # of the transforms: the normal matrix spans ten orders of magnitude
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 6
+_SHIFT_STEPS = 12  # of conjugate gradients
+_SHIFT_TOLERANCE = 1e-3  # gain of such a step, in units of the first one's, that ends them
 _CONVERGED = 0.5  # gain in misfit, against an expected change of 1, that ends the search
 
 
@@ -109,6 +112,7 @@ class ObjectModel:
         self.weights = np.ones(len(low.time)) if weights is None else weights
         # k = 0 is its own conjugate, every other mode stands for two
         self._share = np.where((self.low.k == 0).all(axis=1), 1.0, 2.0)
+        self._root = np.sqrt(self.weights[:, None] * self._share / self.variance)
         self.spacing = SPACING * np.pi / band
         reach = low.radius + _MARGIN * self.spacing
         self._half = int(reach / self.spacing)
@@ -158,7 +162,7 @@ class ObjectModel:
         hessian: Array | None = None
         old = np.inf
         for _ in range(steps):
-            moved = self._shift_step(self._state(path.R[-groups:], low.modes)[1])[0]
+            moved = self._shift_step(path.R[-groups:], self._state(path.R[-groups:], low.modes)[1])
             shift, low = shift + moved, low.shifted(moved)
             normal, state = self._state(path.R[-groups:], low.modes)
             if hessian is None:
@@ -190,13 +194,13 @@ class ObjectModel:
             frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
             middle=state.amplitude @ self.position / state.amplitude.sum(),
-            shift_errors=np.sqrt(np.diagonal(self._shift_step(state)[1], axis1=1, axis2=2)),
+            shift_errors=np.sqrt(np.diagonal(_shift_covariance(state), axis1=1, axis2=2)),
         )
 
     # ------------------------------------------------------------------ one motion
 
     def _square(self, modes: ComplexArray) -> float:
-        return float(np.sum(self.weights[:, None] * self._share / self.variance * np.abs(modes) ** 2))
+        return float(np.sum(np.abs(self._root * modes) ** 2))
 
     def _points(self, R: Array) -> list[Array]:
         """Return where the frames' modes lie in the object's Fourier space, in units of the lattice."""
@@ -206,51 +210,74 @@ class ObjectModel:
     def _normal(self, R: Array, modes: ComplexArray) -> tuple[Array, Array]:
         """Return the normal matrix and the right-hand side of the amplitudes, prior included."""
         points = self._points(R)
-        weight = self.weights[:, None] * self._share * self._blob / self.variance
-        edge, size = 4 * self._half + 1, 2 * self._half + 1
-        kernel = finufft.nufft3d1(
-            *points, (weight * self._blob).ravel().astype(complex), (edge,) * 3, isign=1, eps=_PRECISION
-        ).real
-        right = finufft.nufft3d1(*points, (weight * modes).ravel(), (size,) * 3, isign=1, eps=_PRECISION)
+        kernel = _gathered(points, (self._root * self._blob) ** 2, 4 * self._half + 1)
         normal = kernel.ravel()[self._difference]
         normal[np.diag_indices(len(normal))] += 1.0
-        return normal, np.asarray(right.real[self._mask])
+        return normal, self._right(points, self._root * modes)
+
+    def _right(self, points: list[Array], whitened: ComplexArray) -> Array:
+        """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
+        lattice = _gathered(points, self._root * self._blob * whitened, 2 * self._half + 1)
+        return np.asarray(lattice[self._mask])
+
+    def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
+        """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
+        volume = np.zeros((len(amplitudes), *self._mask.shape), complex)
+        volume[:, self._mask] = amplitudes
+        values = finufft.nufft3d2(*points, volume, isign=-1, eps=_PRECISION)
+        return np.asarray(self._blob * values.reshape(len(amplitudes), *self._root.shape))
 
     def _state(self, R: Array, modes: ComplexArray) -> tuple[Array, _State]:
         """Solve for the object; return its normal matrix and what the gradient needs."""
         normal, right = self._normal(R, modes)
         factor = scipy.linalg.cho_factor(normal, lower=True, check_finite=False)
         amplitude = scipy.linalg.cho_solve(factor, right, check_finite=False)
-        volume = np.zeros((4, *self._mask.shape), complex)
-        volume[0][self._mask] = amplitude
-        for axis in range(3):
-            volume[axis + 1][self._mask] = amplitude * self.position[:, axis]
-        model, *gradient = self._blob * finufft.nufft3d2(
-            *self._points(R), volume, isign=-1, eps=_PRECISION
-        ).reshape(4, *modes.shape)
+        model, *gradient = self._waves(self._points(R), [amplitude, *(amplitude * self.position.T)])
         g1, g2, g3 = np.einsum("gji,jgk->igk", R, np.array(gradient))
         k1, k2 = self.low.k.T
         # R → R exp([ε]×) moves the mode at R k by R (ε × k)
         slopes = np.stack([-1j * k2 * g3, 1j * k1 * g3, -1j * (k1 * g2 - k2 * g1)], axis=-1)
         shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
-        root = np.sqrt(self.weights[:, None] * self._share / self.variance)
         state = _State(
             amplitude,
-            (modes - model) * root,
-            np.concatenate([slopes, shifts], axis=-1) * root[..., None],
+            factor,
+            (modes - model) * self._root,
+            np.concatenate([slopes, shifts], axis=-1) * self._root[..., None],
             self._square(modes) - float(right @ amplitude),
         )
         return normal, state
 
-    @staticmethod
-    def _shift_step(state: _State) -> tuple[Array, Array]:
-        """Return the shifts that reduce the misfit of the modes, and the inverse of their curvature."""
-        shifts = state.slopes[..., 3:]
-        curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
-        curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
-        inverse = np.linalg.inv(curvature)
-        gradient = np.einsum("gki,gk->gi", shifts.conj(), state.residual).real
-        return np.einsum("gij,gj->gi", inverse, gradient), inverse
+    def _shift_step(self, R: Array, state: _State) -> Array:
+        """Return the shifts that lessen the misfit most while the object follows, by conjugate gradients.
+
+        With the object held the shifts would creep, as the object has been fitted to frames out of place.
+        """
+        slopes, covariance, points = state.slopes[..., 3:], _shift_covariance(state), self._points(R)
+
+        def curved(shift: Array) -> Array:
+            moved = np.einsum("gki,gi->gk", slopes, shift)
+            follows = scipy.linalg.cho_solve(state.factor, self._right(points, moved), check_finite=False)
+            moved -= self._root * self._waves(points, [follows])[0]
+            return np.asarray(np.einsum("gki,gk->gi", slopes.conj(), moved).real)
+
+        shift = np.zeros(slopes.shape[::2])
+        downhill = np.einsum("gki,gk->gi", slopes.conj(), state.residual).real
+        direction = step = np.einsum("gij,gj->gi", covariance, downhill)
+        gain = first = float(np.sum(downhill * step))
+        for _ in range(_SHIFT_STEPS):
+            if not gain > _SHIFT_TOLERANCE * first:
+                break
+            image = curved(direction)
+            bend = float(np.sum(direction * image))
+            if not bend > 0:
+                break
+            length = gain / bend
+            shift = shift + length * direction
+            downhill = downhill - length * image
+            step = np.einsum("gij,gj->gi", covariance, downhill)
+            old, gain = gain, float(np.sum(downhill * step))
+            direction = step + gain / old * direction
+        return shift
 
     def _search(
         self, path: Path, low: LowBand, spline: Spline, hessian: Array, state: _State, values: Array
@@ -272,7 +299,7 @@ class ObjectModel:
     def _hessian(self, R: Array, normal: Array, state: _State, values: Array) -> Array:
         """Return half the Hessian by the spline's coefficients, object and shifts eliminated."""
         curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
-        inverse = self._shift_step(state)[1]
+        inverse = _shift_covariance(state)
         carry = curvature[:, :3, 3:] @ inverse
         own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
         root = np.linalg.cholesky(inverse)
@@ -311,9 +338,24 @@ class _State:
     """The object for one motion; residual and slopes are whitened."""
 
     amplitude: Array
+    factor: tuple[Array, bool]
     residual: ComplexArray
     slopes: ComplexArray
     cost: float
+
+
+def _shift_covariance(state: _State) -> Array:
+    """Return the ``(G, 2, 2)`` inverse of the misfit's curvature by the shifts, for a known object."""
+    shifts = state.slopes[..., 3:]
+    curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
+    curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
+    return np.asarray(np.linalg.inv(curvature), float)
+
+
+def _gathered(points: list[Array], values: NDArray[Any], size: int) -> Array:
+    """Return ``Re Σ values exp(i⟨point, b⟩)`` at the lattice points b of a cube of `size` points an edge."""
+    flat = values.ravel().astype(complex)
+    return np.asarray(finufft.nufft3d1(*points, flat, (size,) * 3, isign=1, eps=_PRECISION).real)
 
 
 def _pinned(hessian: Array, R: Array, values: Array) -> Array:

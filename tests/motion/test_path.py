@@ -1,0 +1,130 @@
+"""Splines, bent paths and the removal of the gauge, against closed forms and numerical differentiation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from trapcli.motion.path import Path, Spline, _right_jacobian, align, cross_matrix
+
+SIGMA = np.diag([1.0, 1.0, -1.0])
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def test_splines_sum_to_one_and_their_slopes_are_derivatives() -> None:
+    spline, h = Spline(-1.0, 2.0, 5), 1e-6
+    inside = np.linspace(-0.9, 1.9, 41)
+    assert np.abs(spline.values(inside).sum(axis=1) - 1).max() < 1e-14
+    assert spline.values(inside).shape == (41, spline.size)
+    differences = (spline.values(inside + h) - spline.values(inside - h)) / (2 * h)
+    assert np.abs(spline.slopes(inside) - differences).max() < 1e-7
+
+
+def test_splines_fit_any_cubic_and_any_of_their_own() -> None:
+    spline, t = Spline(0.0, 3.0, 6), np.linspace(0, 3, 60)
+    cubic = np.stack([t**3 - 2 * t, 1 + t**2], axis=1)
+    assert np.abs(spline.values(t) @ spline.fit(t, cubic) - cubic).max() < 2e-5 * np.abs(cubic).max()
+    own = spline.values(t) @ np.random.default_rng(0).normal(size=(spline.size, 3))
+    assert np.abs(spline.values(t) @ spline.fit(t, own) - own).max() < 2e-4 * np.abs(own).max()
+
+
+def test_the_ends_belong_to_the_spline() -> None:
+    spline = Spline(0.0, 1.0, 4)
+    assert spline.values(np.array([0.0, 1.0])).sum(axis=1) == pytest.approx(1)
+
+
+@pytest.mark.parametrize("size", [1e-6, 0.9e-4, 1.1e-4, 1e-2, 1.0, 3.0])
+def test_right_jacobian_against_differences(rng: np.random.Generator, size: float) -> None:
+    delta = rng.normal(size=(20, 3))
+    delta *= size / np.linalg.norm(delta, axis=1)[:, None]
+    h = 1e-5
+    for axis, unit in enumerate(np.eye(3)):
+        before, after = (Rotation.from_rotvec(delta + s * h * unit) for s in (-1, 1))
+        column = (before.inv() * after).as_rotvec() / (2 * h)
+        assert np.abs(_right_jacobian(delta)[:, :, axis] - column).max() < 1e-9
+
+
+def test_cross_matrix(rng: np.random.Generator) -> None:
+    a, b = rng.normal(size=(2, 4, 5, 3))
+    assert np.einsum("...ij,...j->...i", cross_matrix(a), b) == pytest.approx(np.cross(a, b), abs=1e-15)
+
+
+@pytest.mark.parametrize("size", [0.01, 1.0])
+def test_a_bent_path_keeps_R_and_omega_together(
+    two_turns: Any, rng: np.random.Generator, size: float
+) -> None:
+    spline, h = Spline(0.0, 2.0, 5), 1e-5
+    middle = np.linspace(0.05, 1.95, 23)
+    time = (middle[:, None] + [-h, 0, h]).ravel()
+    path = Path(time, two_turns.rotations(time), two_turns.omega(time))
+    coefficients = size * rng.normal(size=(spline.size, 3))
+    bent = path.bent(spline, coefficients)
+    delta = Rotation.from_rotvec(spline.values(time) @ coefficients).as_matrix()
+    assert pytest.approx(path.R @ delta, abs=1e-14) == bent.R
+    before, here, after = (slice(i, None, 3) for i in range(3))
+    turns = np.swapaxes(bent.R[before], 1, 2) @ bent.R[after]
+    numerical = Rotation.from_matrix(turns).as_rotvec() / (2 * h)
+    assert bent.omega[here] == pytest.approx(numerical, abs=1e-8 * np.abs(numerical).max())
+
+
+def test_no_bend_changes_nothing(two_turns: Any) -> None:
+    time = np.linspace(0, 1, 20)
+    path = Path(time, two_turns.rotations(time), two_turns.omega(time))
+    spline = Spline(0.0, 1.0, 4)
+    bent = path.bent(spline, np.zeros((spline.size, 3)))
+    assert np.array_equal(bent.R, path.R)
+    assert np.array_equal(bent.omega, path.omega)
+
+
+def test_constant_angular_velocity() -> None:
+    time, omega = np.array([0.0, 0.1, 0.3, 0.7, 1.0]), np.array([0.3, -1.2, 2.0])
+    path = Path.constant(time, omega)
+    assert path.mean_omega() == pytest.approx(np.tile(omega, (4, 1)), abs=1e-13)
+    assert path.R[2].T @ path.R[3] == pytest.approx(Rotation.from_rotvec(0.4 * omega).as_matrix(), abs=1e-14)
+    assert Path.constant(np.linspace(0, 1, 3), omega).R[1] == pytest.approx(np.eye(3))
+    spline = Spline(0.0, 1.0, 3)
+    smooth = Path.smooth(spline, np.tile(omega, (spline.size, 1)), time)
+    assert smooth.omega == pytest.approx(path.omega, abs=1e-14)
+    assert pytest.approx(path.R[0].T @ path.R, abs=1e-13) == smooth.R
+
+
+def test_a_smooth_path_follows_its_omega(two_turns: Any) -> None:
+    time = np.linspace(0, 1.5, 301)
+    spline = Spline(0.0, 1.5, 40)
+    path = Path.smooth(spline, spline.fit(time, two_turns.omega(time)), time)
+    expected = two_turns.rotations(time)
+    assert np.abs(path.R - expected[0].T @ expected).max() < 1e-6
+
+
+def test_an_extended_path_goes_on_at_the_rate_of_its_ends() -> None:
+    time, omega = np.linspace(0, 1, 31), np.array([1.0, -0.5, 0.7])
+    whole = Path.constant(time, omega)
+    part = Path(time[8:20], whole.R[8:20], whole.omega[8:20])
+    extended = part.extended(time, 8, 4)
+    assert np.array_equal(extended.R[8:20], part.R)
+    assert pytest.approx(whole.R, abs=1e-12) == extended.R
+    assert extended.omega == pytest.approx(whole.omega, abs=1e-12)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_align_removes_the_gauge_exactly(two_turns: Any, rng: np.random.Generator, mirrored: bool) -> None:
+    R = two_turns.rotations(np.linspace(0, 2, 50))
+    constant = Rotation.random(rng=rng).as_matrix()
+    other = constant @ (SIGMA @ R @ SIGMA if mirrored else R)
+    angles, found = align(other, R)
+    assert angles.max() < 1e-12
+    assert found == mirrored
+
+
+def test_align_leaves_what_is_not_gauge(two_turns: Any) -> None:
+    R = two_turns.rotations(np.linspace(0, 2, 50))
+    turn = Rotation.from_rotvec(0.02 * np.tile([0, 1, 0], (50, 1)) * np.linspace(-1, 1, 50)[:, None])
+    angles, _ = align(R @ turn.as_matrix(), R)
+    assert 0.002 < angles.mean() < 0.02
