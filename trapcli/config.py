@@ -35,7 +35,7 @@ class InputConfig:
     channel: int | None = None
     """Channel of a colour or multi-channel input, counted from 0."""
     time_axis: str = ""
-    """Axis that is time where a file has several, such as T or Z; TZ for all frames of both, in stored order."""
+    """Axis that is time where a file has several, such as T or Z; TZ for all frames of both, as stored."""
     dataset: str = ""
     """Path of the dataset inside an HDF5 or Zarr input."""
     frame_interval: float | None = None
@@ -95,9 +95,9 @@ def load_toml(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"{path}: can't be read ({error.strerror or error})") from None
     if len(raw) > MAX_TOML_BYTES:
-        raise ConfigError(f"{path}: larger than {MAX_TOML_BYTES >> 10} KiB, which is no configuration of ours")
+        raise ConfigError(f"{path}: larger than {MAX_TOML_BYTES >> 10} KiB; no configuration of ours is")
     try:
-        # dotted keys and brackets are costly to nest in the standard parser; no configuration of ours needs many
+        # dotted keys and brackets are costly to nest in the standard parser, and none of ours needs many
         text = raw.decode()
         if max((line.count(".") + line.count("[") for line in text.splitlines()), default=0) > 200:
             raise ConfigError(f"{path}: nested too deeply for a configuration")

@@ -1,7 +1,7 @@
 """The errors that trap-motion raises on purpose.
 
-Each message is one line: which file or option, what is wrong, what to do about it. The numbers are the exit codes of
-the command line; nothing here knows of the command line itself.
+Each message is one line: which file or option, what is wrong, what to do about it. The numbers are the exit
+codes of the command line; nothing here knows of the command line itself.
 """
 
 
@@ -18,7 +18,7 @@ class ConfigError(TrapError):
 
 
 class InputError(TrapError):
-    """An input can't be read: missing, truncated, of a kind that isn't supported, or without usable frames."""
+    """An input can't be read: missing, truncated, of an unsupported kind, or without usable frames."""
 
     exit_code = 3
 
