@@ -455,6 +455,19 @@ def test_an_input_that_kills_its_process(stack: Path) -> None:
 # interruption and the terminal
 
 
+@pytest.mark.skipif(os.name != "posix", reason="shell")
+def test_closed_streams(stack: Path) -> None:
+    program = " ".join(f"'{part}'" for part in PROGRAM)
+    paper = " ".join(PAPER)
+    for redirection in (">&-", "2>&-", "<&-"):
+        script = f"{program} estimate sim.tif {paper} --overwrite {redirection}"
+        assert subprocess.run(["bash", "-c", script], check=False, stdout=subprocess.DEVNULL).returncode == 0
+    done = subprocess.run(
+        ["bash", "-c", f"{program} estimate - -o a.h5 <&-"], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (3, "", 1)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("jobs", ["1", "2"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -71,7 +71,7 @@ class Console:
     @contextmanager
     def progress(self) -> Iterator[Progress | None]:
         """Give a progress callback that draws a bar; None without a terminal or when quiet."""
-        if self.verbosity < 0 or not sys.stderr.isatty():
+        if self.verbosity < 0 or sys.stderr is None or not sys.stderr.isatty():
             yield None
             return
         from tqdm import tqdm
