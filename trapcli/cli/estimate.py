@@ -294,10 +294,12 @@ def _outcome(job: Job, motion: Motion, warnings: tuple[str, ...]) -> Outcome:
     import numpy as np
 
     valid = motion.valid > 0
-    speed = np.hypot(motion.alpha, motion.omega_3)[valid]
+    # alpha isn't known where it is too small to be seen
+    speed = np.hypot(np.nan_to_num(motion.alpha), motion.omega_3)
 
-    def median(values: Any) -> float | None:
-        return float(np.median(values)) if len(values) else None
+    def median(series: Any) -> float | None:
+        known = series[valid & np.isfinite(series)]
+        return float(np.median(known)) if len(known) else None
 
     summary = {
         "input": job.source,
@@ -311,9 +313,9 @@ def _outcome(job: Job, motion: Motion, warnings: tuple[str, ...]) -> Outcome:
         "length_unit": motion.length_unit,
         "duration": float(motion.time[-1] - motion.time[0]),
         "median_speed": median(speed),
-        "median_alpha": median(motion.alpha[valid]),
-        "median_omega_3": median(motion.omega_3[valid]),
-        "median_residual": median(motion.residual[valid]),
+        "median_alpha": median(motion.alpha),
+        "median_omega_3": median(motion.omega_3),
+        "median_residual": median(motion.residual),
     }
     if motion.identifiable and valid.any():
         return Outcome(DONE, summary=summary, warnings=warnings)

@@ -34,7 +34,8 @@ def in_processes(
     count:
         Processes at a time.
     """
-    resource_tracker.ensure_running()  # starting it later would let interrupts through again
+    if os.name == "posix":
+        resource_tracker.ensure_running()  # starting it later would let interrupts through again
     processes = _Processes(threads_each=max(1, (os.cpu_count() or 1) // count))
     with ThreadPoolExecutor(count, initializer=_block_interrupts) as executor:
         try:
