@@ -79,7 +79,7 @@ def test_no_bend_changes_nothing(two_turns: Any) -> None:
     path = Path(time, two_turns.rotations(time), two_turns.omega(time))
     spline = Spline(0.0, 1.0, 4)
     bent = path.bent(spline, np.zeros((spline.size, 3)))
-    assert bent.R == pytest.approx(path.R, abs=1e-15)  # the step back to SO(3) rounds
+    assert pytest.approx(path.R, abs=1e-15) == bent.R  # the step back to SO(3) rounds
     assert np.array_equal(bent.omega, path.omega)
 
 
