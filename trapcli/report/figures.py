@@ -250,7 +250,8 @@ def _draw_errors(axes: Axes, matched: Matched) -> None:
 def _draw_landscape(axes: Axes, shown: Motion, exact: Motion | None, steps: Sequence[int]) -> None:
     landscape = shown.landscape
     assert landscape is not None
-    rows = [row for row, frame in enumerate(landscape.frame) if frame in steps] or [0]
+    # by default far from the ends, where time derivatives are best
+    rows = [row for row, frame in enumerate(landscape.frame) if frame in steps] or [len(landscape.frame) // 2]
     shades = matplotlib.colormaps["Blues"](np.linspace(0.95, 0.45, len(rows)))
     for row, shade in zip(rows, shades, strict=True):
         frame = int(landscape.frame[row])
