@@ -56,9 +56,12 @@ def test_what_is_not_known_is_in_frames_and_pixels(scene: tuple[NDArray[Any], Mo
 
 
 def test_a_size_without_a_unit_makes_no_unit(scene: tuple[NDArray[Any], Motion]) -> None:
-    info = StackInfo(frame_interval=INTERVAL, pixel_size=PIXEL)
+    info = StackInfo(frame_interval=INTERVAL, pixel_size=PIXEL, warnings=("its frames are\nodd",))
     motion = trapcli.estimate(Frames.from_array(scene[0], info), config=PAPER)
     assert (motion.time_unit, motion.length_unit) == ("s", "pixel")
+    odd, unit = motion.provenance["warnings"].splitlines()
+    assert odd == "its frames are odd"
+    assert "unit" in unit
     np.testing.assert_allclose(motion.T, scene[1].T / PIXEL, atol=1e-4)
 
 

@@ -66,8 +66,9 @@ def estimate(
     Returns
     -------
     Motion
-        In the geometry, gauge and units of the result file, with the resolved configuration among its
-        provenance; `Motion.identifiable` and `Motion.valid` say what can be trusted.
+        In the geometry, gauge and units of the result file, with the resolved configuration and what the
+        frames themselves give reason to doubt (``warnings``, one a line) among its provenance;
+        `Motion.identifiable` and `Motion.valid` say what can be trusted.
 
     Raises
     ------
@@ -95,6 +96,8 @@ def estimate(
         projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
     )
     origin = provenance.collect(configuration=to_toml(config))
+    if warnings := _warnings(projections, config):
+        origin["warnings"] = "\n".join(warnings)
     return replace(
         motion, time_unit=time_unit, length_unit=length_unit, provenance=motion.provenance | origin
     )
@@ -133,3 +136,14 @@ def _units(frames: Frames) -> tuple[float, str, float, str]:
     if info.pixel_size and info.pixel_unit:
         return step, time_unit, info.pixel_size, info.pixel_unit
     return step, time_unit, 1.0, "pixel"
+
+
+def _warnings(frames: Frames, config: EstimateConfig) -> list[str]:
+    """Say what to know before trusting these frames, one sentence each."""
+    info = frames.info
+    warnings = list(info.warnings)
+    if info.lossy and not config.preprocess.attenuation:
+        warnings.append("its lossy codec has changed the pixel values, of which a logarithm is taken")
+    if info.pixel_size and not info.pixel_unit:
+        warnings.append("the unit of its pixel size is not known, so lengths are in pixels")
+    return [" ".join(warning.split()) for warning in warnings]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 DONE, SOME_FAILED, NOT_TRUSTWORTHY = 0, 1, 4
 STANDARD_INPUT = "-"
-BACKGROUNDS = ("auto", "median", "border", "none")
+BACKGROUNDS = ("auto", "median", "surface", "border", "none")
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,11 @@ def _roi(_context: click.Context, _option: click.Parameter, value: str | None) -
 @click.option("-o", "--output", type=PATH, help="Result of a single input.  [default: INPUT with .h5]")
 @click.option(
     "--background",
-    metavar="FILE|auto|median|border|none",
-    help="The empty field: an image or stack of it, the median in time, a surface through each frame's "
-    "border, or none.  [default: auto]",
+    metavar="FILE|auto|median|surface|border|none",
+    help="The empty field: an image or stack of it, the median in time, a surface fitted to what the particle "
+    "leaves free, a surface through each frame's border, or none.  [default: auto]",
 )
+@click.option("--dark", metavar="LEVEL|FILE", help="Pixel value without light, or frames without.  [default: 0]")
 @click.option(
     "--attenuation",
     is_flag=True,
@@ -165,7 +166,7 @@ def _tables(options: dict[str, Any]) -> dict[str, Any]:
     names = ("frames", "roi", "channel", "time_axis", "dataset", "frame_interval", "pixel_size", "pixel_unit")
     return {
         "input": {name: options[name] for name in (*names, "allow_partial")},
-        "preprocess": {name: options[name] for name in ("attenuation", "background")},
+        "preprocess": {name: options[name] for name in ("attenuation", "background", "dark")},
         "motion": {"method": options["method"]},
     }
 
@@ -200,6 +201,7 @@ def _checked(jobs: Sequence[Job], resume: bool) -> list[Job]:
             checked.append(job)  # there is no input either
             continue
         refuse_input(job.output, Path(job.source), Path(job.config.preprocess.background))
+        refuse_input(job.output, Path(job.source), Path(job.config.preprocess.dark))
         if resume and job.output.is_file():
             job = replace(job, finished=_is_up_to_date(job))
             if not job.finished and not job.overwrite:
@@ -250,7 +252,7 @@ def run_job(job: Job, progress: Progress | None = None) -> Outcome:
 
     try:
         if job.finished:
-            return _outcome(job, Motion.load(job.output), ())
+            return _outcome(job, Motion.load(job.output))
         return _estimate(job, progress)
     except TrapError as error:
         return Outcome(error.exit_code, str(error), traceback=traceback.format_exc())
@@ -268,12 +270,7 @@ def _estimate(job: Job, progress: Progress | None) -> Outcome:
     motion = estimate(frames, config=job.config, progress=progress)
     motion = replace(motion, provenance=motion.provenance | _origin(job, frames))
     motion.save(job.output, overwrite=job.overwrite)
-    info, warnings = frames.info, frames.info.warnings
-    if info.lossy and not job.config.preprocess.attenuation:
-        warnings = (*warnings, "its lossy codec has changed the pixel values, of which a logarithm is taken")
-    if info.pixel_size and not info.pixel_unit:
-        warnings = (*warnings, "the unit of its pixel size is not known, so lengths are in pixels")
-    return _outcome(job, motion, warnings)
+    return _outcome(job, motion)
 
 
 def _origin(job: Job, frames: Frames) -> dict[str, str]:
@@ -281,16 +278,27 @@ def _origin(job: Job, frames: Frames) -> dict[str, str]:
     from trapcli.result import provenance
     from trapcli.stack import open_stack
 
-    background = job.config.preprocess.background
+    preprocess = job.config.preprocess
+    given = [] if preprocess.background in BACKGROUNDS else [preprocess.background]
+    if preprocess.dark and not _is_number(preprocess.dark):
+        given.append(preprocess.dark)
     files = frames.info.files
-    if not job.config.preprocess.attenuation and background not in BACKGROUNDS:
-        files = (*files, *open_stack(background).info.files)
+    for path in given * (not preprocess.attenuation):
+        files = (*files, *open_stack(path).info.files)
     names = (STANDARD_INPUT if job.source == STANDARD_INPUT else "", *[""] * len(files))
     lines = [provenance.checksum_line(file, name) for file, name in zip(files, names, strict=False)]
     return {"command_line": job.command_line, "inputs": "\n".join(lines)}
 
 
-def _outcome(job: Job, motion: Motion, warnings: tuple[str, ...]) -> Outcome:
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _outcome(job: Job, motion: Motion) -> Outcome:
     import numpy as np
 
     valid = motion.valid > 0
@@ -317,6 +325,7 @@ def _outcome(job: Job, motion: Motion, warnings: tuple[str, ...]) -> Outcome:
         "median_omega_3": median(motion.omega_3),
         "median_residual": median(motion.residual),
     }
+    warnings = tuple(motion.provenance.get("warnings", "").splitlines())
     if motion.identifiable and valid.any():
         return Outcome(DONE, summary=summary, warnings=warnings)
     message = f"{job.source}: not trustworthy: {motion.verdict.removeprefix('not trustworthy: ')}"
