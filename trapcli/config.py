@@ -55,7 +55,18 @@ class PreprocessConfig:
     attenuation: bool = False
     """The frames already are attenuation or phase projections: no background, no logarithm."""
     background: str = "auto"
-    """``auto``, ``median``, ``border``, ``none``, or the path of a background file (one frame or a stack)."""
+    """``auto``, ``median``, ``surface``, ``border``, ``none``, or the path of a background file (one frame or
+    a stack)."""
+    dark: str = ""
+    """Pixel value without light, or the path of a file of dark frames; empty: 0."""
+
+    @property
+    def dark_level(self) -> float | None:
+        """`dark` as a pixel value; None where it is a path."""
+        try:
+            return float(self.dark or 0)
+        except ValueError:
+            return None
 
 
 @dataclass(frozen=True)

@@ -1,33 +1,49 @@
 """Attenuation J = −log(I / I₀) from raw intensities, block by block.
 
-The background I₀ is the empty field as the camera sees it: measured, the median in time of a moving object,
-or a smooth surface through each frame's border. How much brighter or darker a frame is as a whole, its
-border tells.
+The background I₀ is the empty field as the camera sees it: measured, the median in time of a moving particle,
+a surface fitted to what a particle that stays leaves free, or a surface through each frame's border. How much
+brighter or darker a frame is as a whole, its free pixels tell.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter
 
-from trapcli.config import InputConfig, PreprocessConfig
+from trapcli.config import PreprocessConfig
 from trapcli.errors import InputError
+from trapcli.preprocess.counts import Counts, mean_image
+from trapcli.preprocess.surface import Light, border, fit_empty_field, median_field
 from trapcli.stack.frames import Frames
-from trapcli.stack.opening import open_stack
 
 Array = NDArray[np.float64]
-Background = Callable[[NDArray[Any]], NDArray[Any]]
-"""Gives I₀ for a block of frames, broadcastable to it."""
 
-_SAMPLED = 64  # frames of a median
-_BORDER = 0.04  # width of the border, as a share of the shorter edge
-_GHOST = 0.25  # depth of what a median may keep, as a share of the object's
-_DARK_PIXELS = 0.01  # share of pixels without light beyond which a frame can't be judged
+_FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
+_LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
+_COVERED = 0.01  # share of the pixels that may be free less often
+_FULL = 0.05  # share of free pixels below which little tells the empty field
+
+
+@dataclass(frozen=True)
+class _Background:
+    """What is taken off the frames, and what is to be said about it.
+
+    Attributes
+    ----------
+    log_light:
+        Gives ``(H, W)`` log I₀ for the logarithm of one frame's light; NaN where it isn't known.
+    keep_bright:
+        Whether overexposed frames are kept, because most are.
+    """
+
+    log_light: Callable[[NDArray[Any]], NDArray[Any]]
+    note: str
+    warnings: tuple[str, ...] = ()
+    keep_bright: bool = False
 
 
 def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, ...] = ()) -> Frames:
@@ -36,157 +52,131 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     Parameters
     ----------
     frames:
-        Raw intensities, dark level 0; with `config.attenuation` what is wanted already, and returned as it
-        is.
+        Raw intensities; with `config.attenuation` what is wanted already, and returned as it is.
     config:
-        Where the background comes from: the path of a file (the mean of its frames), ``median``, ``border``,
-        ``none`` (a flat field as bright as each frame's border) or ``auto`` (``median`` unless the object
-        stays in it, else ``border``).
+        Where the background comes from: the path of a file (the mean of its frames), ``median`` in time,
+        ``surface`` (fitted to all that the particle leaves free, with the specks that stay in place),
+        ``border`` (a surface through each frame's border), ``none`` (a flat field as bright as that) or
+        ``auto`` (``median`` where the particle leaves its place, else ``surface``). `config.dark` is taken
+        off frames and background.
     roi:
-        Region of the background file that the frames show: (top, bottom, left, right).
+        Region of the background and dark files that the frames show: (top, bottom, left, right).
 
     Returns
     -------
     Frames
-        float32, or float64 where the input is. Pixels without light count as half a step above none; a frame
-        with more than 1 % of them is all NaN.
+        float32, or float64 where the input is. Pixels without light count as half a step above none. A frame
+        is all NaN where more than 1 % of it has no light, or is as bright as a pixel can be while most frames
+        are not. `StackInfo.notes` says which background was taken and why, `StackInfo.warnings` what is
+        doubtful.
 
     Raises
     ------
+    ConfigError
+        For a dark level that is no level.
     InputError
-        Where the background can't be read or doesn't fit; while reading, where most frames hold no light.
+        Where background or dark frames can't be read or don't fit; while reading, where most frames hold no
+        light.
     """
     if config.attenuation:
         return frames
-    background = _background(frames, config.background, roi)
+    counts = Counts.of(frames, config, roi)
+    background = _background(frames, config.background, roi, counts)
     dtype = np.dtype(np.float64 if frames.dtype == np.float64 else np.float32)
 
     def read_blocks(size: int) -> Iterator[NDArray[Any]]:
         dark = 0
         for block in frames.read_blocks(size):
-            attenuation = _minus_log(block, background(block), dtype)
-            dark += int(np.isnan(attenuation[:, 0, 0]).sum())
+            projections = np.full(block.shape, np.nan, dtype)
+            for image, projection in zip(block, projections, strict=True):
+                light = counts.log_light(image, dtype)
+                dark += int(light.dark.mean() > _FLAGGED)
+                spoilt = light.dark if background.keep_bright else light.dark | light.bright
+                if spoilt.mean() <= _FLAGGED:
+                    projection[:] = _attenuation(light.values, background)
             if dark > len(frames) / 2:
                 raise InputError(
                     f"{frames.info.source}: most frames have pixels of 0 or less, which have no logarithm; "
                     "give --attenuation if they are attenuation already"
                 )
-            yield attenuation
+            yield projections
 
-    return replace(frames, dtype=dtype, read_blocks=read_blocks)
-
-
-def _background(frames: Frames, source: str, roi: tuple[int, ...]) -> Background:
-    if source in ("border", "none"):
-        degree = 2 if source == "border" else 0
-        return lambda block: _border_surface(block, degree)
-    if source not in ("auto", "median"):
-        field = _from_file(frames, source, roi)
-        return lambda block: _scaled(field, block)
-    sample = _sample(frames)
-    field = np.median(sample, axis=0)
-    if source == "auto" and _keeps_object(field, sample):
-        return lambda block: _border_surface(block, 2)
-    return lambda block: _scaled(field, block)
+    info = replace(
+        frames.info,
+        notes=(*frames.info.notes, background.note),
+        warnings=(*frames.info.warnings, *background.warnings),
+    )
+    return replace(frames, dtype=dtype, read_blocks=read_blocks, info=info)
 
 
-def _from_file(frames: Frames, path: str, roi: tuple[int, ...]) -> Array:
-    """Return the mean of a background file's frames."""
-    empty = open_stack(path, InputConfig(roi=roi))
-    if empty.shape[1:] != frames.shape[1:]:
-        sizes = " but ".join("{} x {}".format(*f.shape[1:]) for f in (empty, frames))
-        raise InputError(f"{path}: the background is {sizes.replace(' but ', ' pixels but the frames are ')}")
-    total = np.zeros(empty.shape[1:])
-    for block in empty.blocks():
-        total += block.sum(axis=0, dtype=float)
-    return total / len(empty)
+def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any] | float:
+    """Return log I₀ − log I, 0 in pixels of unknown background; NaN where that is unknown in most."""
+    attenuation = background.log_light(logs) - logs
+    unknown = np.isnan(attenuation)
+    return np.nan if unknown.mean() > 0.5 else np.where(unknown, 0.0, attenuation)
 
 
-def _sample(frames: Frames) -> Array:
-    """Return at most 64 frames spread over the stack, equally bright at the border, without dark ones."""
-    wanted = np.unique(np.linspace(0, len(frames) - 1, min(_SAMPLED, len(frames))).round().astype(int))
-    kept: list[NDArray[Any]] = []
-    done = 0
-    for block in frames.blocks():
-        inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
-        for image in np.asarray(block[inside], dtype=float):
-            brightness = float(np.median(image[_border(image.shape)]))
-            if brightness > 0:
-                kept.append(image / brightness)
-        done += len(block)
-    if not kept:
-        raise InputError(
-            f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"
+def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
+    if source == "border":
+        return _Background(lambda logs: _border_surface(logs, 2), "background: a surface through the border")
+    if source == "none":
+        return _Background(lambda logs: _border_surface(logs, 0), "background: none, a flat field")
+    if source not in ("auto", "median", "surface"):
+        light = mean_image(frames, source, roi, "background") - counts.dark
+        with np.errstate(invalid="ignore", divide="ignore"):
+            field = np.where(light > 0, np.log(light), np.nan)
+        return _Background(_lit(field, Light.over(border(field.shape))), f"background: {source}")
+    sample, overexposed = counts.sample(frames, _FLAGGED)
+    fitted = fit_empty_field(sample)
+    covered = float(np.mean(fitted.outside < _LEAVES))
+    warnings = ["most frames are overexposed; what is thin can't be measured in them"] if overexposed else []
+    if source == "median" or (source == "auto" and covered <= _COVERED):
+        note = (
+            f"background: median in time; the particle leaves {1 - covered:.0%} of the frame most of the time"
         )
-    return np.array(kept)
+        if covered > _COVERED:
+            warnings.append(
+                f"the particle covers {covered:.0%} of the frame most of the time, so the median shows it; "
+                "give the background as a file, or take surface"
+            )
+        field = median_field(sample)
+        light_of = Light.over(border(field.shape))
+        return _Background(_lit(field, light_of), note, tuple(warnings), overexposed)
+    note = (
+        f"background: a surface of degree {fitted.degree} and {fitted.specks} specks; "
+        f"the particle stays over {covered:.0%} of the frame"
+    )
+    if (fitted.outside > 0).mean() < _FULL:
+        warnings.append("the particle fills the frame, so its background is a guess; give one as a file")
+    return _Background(_lit(fitted.log_light, fitted.light), note, tuple(warnings), overexposed)
 
 
-def _keeps_object(field: Array, sample: Array) -> bool:
-    """Tell whether a median in time still shows the object, because that does not leave its place."""
+def _lit(field: Array, light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return the background as bright as each frame."""
 
-    def depth(images: Array) -> float:
-        attenuation = np.abs(_minus_log(images, _border_surface(images, 2), np.dtype(float)))
-        # specks are small, an object is not
-        size = max(3, min(field.shape) // 12)
-        return float(np.median(uniform_filter(attenuation, (0, size, size)).max(axis=(1, 2))))
+    def log_light(logs: NDArray[Any]) -> NDArray[Any]:
+        empty = field.astype(logs.dtype)
+        return np.asarray(empty + light.of(light.fit(logs - empty), empty.shape).astype(logs.dtype))
 
-    return depth(field[None]) > _GHOST * depth(sample)
+    return log_light
 
 
-def _minus_log(block: NDArray[Any], background: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return −log(I / I₀); frames with too many pixels without light become NaN."""
-    step = 0.5 if block.dtype.kind in "iub" else _smallest(block)
-    light = np.asarray(block, dtype=dtype)
-    field = np.broadcast_to(np.asarray(background, dtype=dtype), light.shape)
-    lit = np.isfinite(light) & (light > 0)
-    known = np.isfinite(field) & (field > 0)
-    ratio = np.divide(np.where(lit, light, step), field, out=np.ones_like(light), where=known)
-    attenuation: NDArray[Any] = -np.log(ratio)
-    dark = (known & ~lit).mean(axis=(1, 2)) > _DARK_PIXELS
-    attenuation[dark | (known.mean(axis=(1, 2)) < 0.5)] = np.nan
-    return attenuation
-
-
-def _smallest(block: NDArray[Any]) -> float:
-    """Return half the smallest light in a block of floats."""
-    positive = block[np.isfinite(block) & (block > 0)]
-    return float(positive.min()) / 2 if positive.size else 1.0
-
-
-def _border(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    width = max(2, round(_BORDER * min(shape)))
-    border = np.ones(shape, bool)
-    border[width:-width, width:-width] = False
-    return border
-
-
-def _scaled(field: Array, block: NDArray[Any]) -> Array:
-    """Return the background as bright as the border of each frame."""
-    border = _border(field.shape) & (field > 0)
-    if not border.any():
-        return field[None]
-    brightness = np.median(block[:, border] / field[border], axis=1)
-    brightness = np.where(brightness > 0, brightness, 1.0)
-    return np.asarray(brightness[:, None, None] * field)
-
-
-def _border_surface(block: NDArray[Any], degree: int) -> Array:
-    """Fit a polynomial surface through the border of each frame, the second time without outliers."""
-    height, width = block.shape[1:]
+def _border_surface(logs: NDArray[Any], degree: int) -> Array:
+    """Fit a polynomial surface through a frame's border, the second time without outliers."""
+    image = np.exp(logs.astype(float))
+    height, width = image.shape
     x2, x1 = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
     basis = np.stack([x1**i * x2**j for i, j in powers], axis=-1)
-    border = _border((height, width))
-    surfaces = []
-    for image in block:
-        values, columns = image[border].astype(float), basis[border]
-        keep = np.isfinite(values)
-        coefficients = np.zeros(len(powers))
-        for _ in range(2):
-            if keep.sum() < len(powers):
-                break
-            coefficients = np.linalg.lstsq(columns[keep], values[keep], rcond=None)[0]
-            misfit = np.abs(values - columns @ coefficients)
-            keep &= misfit <= 3 * np.median(misfit[keep]) + 1e-12
-        surfaces.append(basis @ coefficients)
-    return np.array(surfaces)
+    edge = border((height, width))
+    values, columns = image[edge], basis[edge]
+    keep = np.isfinite(values)
+    coefficients = np.zeros(len(powers))
+    for _ in range(2):
+        if keep.sum() < len(powers):
+            break
+        coefficients = np.linalg.lstsq(columns[keep], values[keep], rcond=None)[0]
+        misfit = np.abs(values - columns @ coefficients)
+        keep &= misfit <= 3 * np.median(misfit[keep]) + 1e-12
+    surface = basis @ coefficients
+    return np.asarray(np.log(np.where(surface > 0, surface, np.nan)))

@@ -31,6 +31,8 @@ class StackInfo:
         True where the codec has changed the pixel values.
     warnings:
         What the user should know before trusting these frames, one sentence each.
+    notes:
+        What was done to the frames since they were read, one sentence each.
     files:
         The files the frames come from; a folder stands for all that is in it.
     """
@@ -44,6 +46,7 @@ class StackInfo:
     bits: int | None = None
     lossy: bool = False
     warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
 
 

@@ -1,0 +1,361 @@
+"""The empty field of a stack whose particle never leaves its place.
+
+A frame is I(t, x) = f(t) I₀(x) exp(−J(t, x)). Outside of the particle J is 0, so there log I − log f is
+log I₀, seen in many frames: a smooth surface is fitted to all of it and carried on under the particle. What
+is sharp in I₀ (dust, dirt) stays in place while the particle's projection moves and turns, which tells the
+two apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Array = NDArray[np.float64]
+Stack = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+_BORDER = 0.04  # width of the border, as a share of the shorter edge
+_DEGREES = (2, 4, 6)  # of the surface; the one that best foretells the field beside the particle is taken
+_PATCH = 5  # edge of the mean in which the particle must stand out [pixels]
+_DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, as a share of its peak
+_CLEAR = 0.8  # the same in standard deviations of a pixel: 4 of the mean over a patch
+_MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
+_DIRECT = (
+    0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
+)
+_SIGNIFICANT = 4.0  # standard deviations
+_SPECK = 3.0  # size of a speck [pixels]: what is smoother belongs to the particle or to the surface
+_STEADY = 3.0  # depth of a speck in units of its scatter in time: the particle's own features move
+_ROUND = 0.3  # least ratio of its curvatures
+_REACH = 5  # farthest that a speck extends from such a place [pixels]
+_FLANK = 0.3  # depth of its flank, as a share of its own
+_RIM = 3  # width by which a speck is larger than what stands out of it [pixels]
+_MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
+_PARTS = 8  # of the stack, in which a speck must be found
+_AROUND = 5  # width of a speck's surroundings [pixels]
+_SMOOTH = 3  # degree of the particle around a speck
+_FAINTEST = 0.005  # depth of a speck
+_QUIET = 0.95  # share of frames in which a pixel that tells the brightness lies outside of the particle
+_LEAST_QUIET = 0.02  # share of such pixels below which the border has to do
+_TILTED = 0.003  # least tilt of the light, from the middle to the edge of a frame, that is taken out
+_MOST_PIXELS = 65536  # of a surface, and of a frame's brightness: enough for both
+
+
+@dataclass(frozen=True)
+class Light:
+    """How bright each frame is, told by pixels that the particle leaves free.
+
+    Attributes
+    ----------
+    pixels:
+        ``(P,)`` those pixels, as positions in the flattened frame.
+    basis:
+        ``(P, B)`` values there of 1, or of 1, x1 and x2.
+    surface:
+        ``(B, H·W)`` the same in all pixels.
+    """
+
+    pixels: NDArray[np.intp]
+    basis: Array
+    surface: Array
+
+    @classmethod
+    def over(cls, free: Bools, *, tilted: bool = False) -> Light:
+        """Use the pixels of a ``(H, W)`` mask; the border where they are too few."""
+        if free.mean() < _LEAST_QUIET:
+            free = border(free.shape)
+        pixels = np.flatnonzero(free)
+        pixels = pixels[:: -(-len(pixels) // _MOST_PIXELS)]
+        x2, x1 = (axis.ravel() for axis in np.meshgrid(*map(_unit, free.shape), indexing="ij"))
+        surface = np.stack([np.ones(free.size), x1, x2][: 3 if tilted else 1])
+        return cls(pixels, surface[:, pixels].T, surface)
+
+    def fit(self, log_ratio: NDArray[np.floating]) -> Array:
+        """Return the ``(B,)`` coefficients of the light in ``(H, W)`` log(I / I₀); NaN where not known."""
+        values = log_ratio.ravel()[self.pixels].astype(float)
+        keep = np.isfinite(values)
+        coefficients = np.full(self.basis.shape[1], np.nan)
+        if keep.sum() < 3 * self.basis.shape[1]:
+            return coefficients
+        values, basis = values[keep], self.basis[keep]
+        misfit = values - np.median(values)
+        for _ in range(2):
+            near = np.abs(misfit) <= 3 * 1.4826 * np.median(np.abs(misfit)) + 1e-12
+            if self.basis.shape[1] == 1:
+                coefficients = np.array([values[near].mean()])
+            else:
+                coefficients = np.linalg.lstsq(basis[near], values[near], rcond=None)[0]
+            misfit = values - basis @ coefficients
+        return coefficients
+
+    def of(self, coefficients: Array, shape: tuple[int, ...]) -> Array:
+        """Return the light in all pixels."""
+        return np.asarray((coefficients @ self.surface).reshape(shape))
+
+    def even(self, log_ratio: Stack) -> Stack:
+        """Return a ``(K, H, W)`` log(I / I₀) without each frame's light; all NaN where nothing tells it."""
+        coefficients = np.array([self.fit(image) for image in log_ratio])
+        light = coefficients.astype(np.float32) @ self.surface.astype(np.float32)
+        return np.asarray(log_ratio - light.reshape(log_ratio.shape))
+
+
+@dataclass(frozen=True)
+class EmptyField:
+    """The field without the particle.
+
+    Attributes
+    ----------
+    log_light:
+        ``(H, W)`` log I₀.
+    light:
+        Tells the brightness of a frame.
+    outside:
+        ``(H, W)`` share of the frames in which a pixel lies outside of the particle.
+    degree, specks:
+        Of the surface; number of specks found.
+    """
+
+    log_light: Array
+    light: Light
+    outside: Array
+    degree: int
+    specks: int
+
+
+def border(shape: tuple[int, ...]) -> Bools:
+    """Return the mask of a frame's border."""
+    width = max(2, round(_BORDER * min(shape)))
+    mask = np.ones(shape, bool)
+    mask[width:-width, width:-width] = False
+    return mask
+
+
+def median_field(logs: Stack) -> Array:
+    """Return the median in time of ``(K, H, W)`` log I, made equally bright at the border."""
+    return _middle(Light.over(border(logs.shape[1:])).even(logs))
+
+
+def fit_empty_field(logs: Stack) -> EmptyField:
+    """Find the field without the particle in frames that all show it.
+
+    Parameters
+    ----------
+    logs:
+        ``(K, H, W)`` log I of frames spread over the stack; NaN where a pixel tells nothing.
+
+    Returns
+    -------
+    EmptyField
+        Where the particle is never away the field is a polynomial in log I₀ plus the specks that stay in
+        place; elsewhere it is measured as far as the noise allows.
+    """
+    edge = border(logs.shape[1:])
+    light = Light.over(edge)
+    common = _middle(light.even(logs))
+    field = _surface(common, edge & np.isfinite(common), 2)
+    noise = _noise(logs, edge)
+    degree, pattern, specks = 2, np.zeros(field.shape), 0
+    outside = np.ones(logs.shape, bool)
+    for depth in _DEPTHS:
+        residual = light.even(logs - (field + pattern).astype(np.float32))
+        outside = _outside(residual, noise, depth)
+        light = Light.over(outside.mean(axis=0) >= _QUIET)
+        mean, count = _mean_outside(light.even(logs - (field + pattern).astype(np.float32)), outside)
+        mean += field + pattern
+        degree = _degree(mean, count)
+        field = _surface(mean, count, degree)
+        pattern, specks = _pattern(light.even(logs - field.astype(np.float32)), mean - field, count, noise)
+    quiet = outside.mean(axis=0) >= _QUIET
+    total = field + pattern
+    tilted = _is_tilted(logs - total.astype(np.float32), quiet, noise)
+    return EmptyField(total, Light.over(quiet, tilted=tilted), outside.mean(axis=0), degree, specks)
+
+
+def _unit(size: int) -> Array:
+    return np.linspace(-1.0, 1.0, size)
+
+
+def _middle(stack: Stack) -> Array:
+    """Return the median in time of each pixel that tells anything."""
+    middle = np.full(stack.shape[1:], np.nan)
+    for row, values in enumerate(np.moveaxis(stack, 1, 0)):
+        finite = np.isfinite(values)
+        if finite.all():
+            middle[row] = np.median(values, axis=0)
+        else:
+            told = finite.any(axis=0)
+            middle[row, told] = np.nanmedian(values[:, told], axis=0)
+    return middle
+
+
+def _noise(logs: Stack, edge: Bools) -> float:
+    """Return the standard deviation of a pixel, from differences of neighbours at the border."""
+    both = edge[:, 1:] & edge[:, :-1]
+    differences = np.diff(logs, axis=2)[:, both]
+    differences = differences[np.isfinite(differences)]
+    if not len(differences):
+        return 0.0
+    return float(1.4826 * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2))
+
+
+def _outside(residual: Stack, noise: float, depth: float) -> Bools:
+    """Tell which pixels of each frame the particle leaves free, with a margin around it."""
+    smooth = np.array([ndimage.uniform_filter(np.nan_to_num(image), _PATCH) for image in residual])
+    peak = float(np.median(np.quantile(np.abs(smooth), 0.999, axis=(1, 2))))
+    inside = np.abs(smooth) > max(_CLEAR * noise, depth * peak)
+    reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
+    grown = [ndimage.maximum_filter(image, reach) for image in inside]
+    return ~np.array(grown) & np.isfinite(residual)
+
+
+def _mean_outside(residual: Stack, outside: Bools) -> tuple[Array, Array]:
+    """Return the mean over the frames in which a pixel is free, and their number."""
+    count = outside.sum(axis=0, dtype=float)
+    total = np.where(outside, residual, 0).sum(axis=0, dtype=float)
+    return total / np.maximum(count, 1), count
+
+
+def _surface(values: Array, weights: NDArray[np.generic], degree: int) -> Array:
+    """Fit a polynomial surface to ``(H, W)`` values, without what does not belong to it."""
+    stride = max(1, round(np.sqrt(values.size / _MOST_PIXELS)))
+    axes = [chebyshev.chebvander(_unit(size), degree) for size in values.shape]
+    orders = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    rows, columns = np.nonzero(np.asarray(weights, dtype=float)[::stride, ::stride] > 0)
+    if len(rows) < 3 * len(orders):
+        return np.full(values.shape, float(np.nanmedian(values)))
+    rows, columns = rows * stride, columns * stride
+    basis = np.stack([axes[0][rows, i] * axes[1][columns, j] for i, j in orders], axis=1)
+    told, root = values[rows, columns], np.sqrt(np.asarray(weights, dtype=float)[rows, columns])
+    robust = np.ones(len(told))
+    for _ in range(6):
+        scale = root * robust
+        coefficients = np.linalg.lstsq(basis * scale[:, None], told * scale, rcond=None)[0]
+        misfit = (told - basis @ coefficients) * root
+        limit = 4.685 * 1.4826 * np.median(np.abs(misfit)) + 1e-12
+        robust = np.clip(1 - (misfit / limit) ** 2, 0, None)
+    square = np.zeros((degree + 1, degree + 1))
+    square[tuple(np.transpose(orders))] = coefficients
+    return np.asarray(axes[0] @ square @ axes[1].T)
+
+
+def _degree(mean: Array, count: Array) -> int:
+    """Return the degree whose fit to the field away from the particle best foretells the field beside it."""
+    free = count >= _DIRECT * count.max()
+    if free.all():
+        return _DEGREES[1]
+    distance = ndimage.distance_transform_edt(free)
+    beside = free & (distance <= np.quantile(distance[free], 0.25))
+    errors = []
+    for degree in _DEGREES:
+        misfit = np.abs(mean - _surface(mean, np.where(free & ~beside, count, 0), degree))[beside]
+        errors.append(float(np.sqrt(np.mean(np.minimum(misfit, 3 * np.median(misfit)) ** 2))))
+    return next(d for d, error in zip(_DEGREES, errors, strict=True) if error <= 1.05 * min(errors))
+
+
+def _pattern(residual: Stack, direct: Array, count: Array, noise: float) -> tuple[Array, int]:
+    """Return what the surface lacks: what is measured outside of the particle, and specks under it."""
+    measured = count >= _DIRECT * len(residual)
+    scatter = noise / np.sqrt(np.maximum(count, 1))
+    clear = measured & (np.abs(direct) > _SIGNIFICANT * scatter)
+    excess = np.median(np.abs(direct[measured & ~clear])) if (measured & ~clear).any() else 0.0
+    spread = max(
+        (1.4826 * excess) ** 2 - float(np.median(scatter[measured]) if measured.any() else 0) ** 2, 0
+    )
+    trust = np.where(clear, 1.0, spread / np.maximum(spread + scatter**2, 1e-300))
+    pattern = np.where(measured, trust * direct, 0.0)
+    regions = _speck_regions(residual)
+    number = 0
+    whole = float(np.abs(np.nan_to_num(residual)).sum(dtype=float)) / len(residual)
+    for label, place in enumerate(ndimage.find_objects(regions), start=1):
+        window, depth = _speck_depth(residual, regions, label, place)
+        spot = regions[window] == label
+        # what makes up most of all there is to see is the particle
+        if depth is not None and np.abs(depth[spot]).sum() < _MOST * whole:
+            here = spot & ~measured[window]
+            pattern[window][here] = depth[here]
+            number += 1
+    return pattern, number
+
+
+def _speck_regions(residual: Stack) -> NDArray[np.int32]:
+    """Label the regions of sharp spots that are in the same place in (almost) all parts of the stack."""
+    sharp = np.empty(residual.shape, np.float16)  # holds what is sharp to 1e-3 of it
+    for k, image in enumerate(residual):
+        sharp[k] = _sharp(np.nan_to_num(image))
+    middle, scatter = _middle_and_scatter(sharp)
+    parts = [_middle_and_scatter(part)[0] for part in np.array_split(sharp, min(_PARTS, len(sharp)))]
+    depths = np.sort(np.array(parts) * np.sign(middle), axis=0)
+    # in one part the particle's edge may hide the speck
+    least = depths[min(1, len(depths) - 1)]
+    found = least > np.maximum(_STEADY * scatter, _FAINTEST)
+    seeds = found & _is_compact(middle)
+    found &= least > _FLANK * ndimage.maximum_filter(np.where(seeds, least, 0), 2 * _REACH + 1)
+    grown = ndimage.binary_dilation(seeds, iterations=_REACH, mask=found)
+    labels, _ = ndimage.label(ndimage.binary_dilation(grown, iterations=_RIM))
+    return np.asarray(labels, dtype=np.int32)
+
+
+def _is_compact(image: Array) -> Bools:
+    """Tell where an image curves alike in all directions, as a speck does and the particle's edge doesn't."""
+    along, across, mixed = (ndimage.gaussian_filter(image, 1.0, order) for order in ((2, 0), (0, 2), (1, 1)))
+    mean, deviation = (along + across) / 2, np.hypot((along - across) / 2, mixed)
+    return np.asarray(np.abs(mean) - deviation > _ROUND * (np.abs(mean) + deviation))
+
+
+def _middle_and_scatter(stack: NDArray[np.float16]) -> tuple[Array, Array]:
+    """Return median in time and scatter about it."""
+    middle, scatter = np.empty((2, *stack.shape[1:]))
+    for row in range(stack.shape[1]):
+        values = stack[:, row].astype(np.float32)
+        middle[row] = np.median(values, axis=0)
+        scatter[row] = 1.4826 * np.median(np.abs(values - middle[row]), axis=0)
+    return middle, scatter
+
+
+def _sharp(image: Stack) -> Stack:
+    return np.asarray(ndimage.gaussian_filter(image, 0.7) - ndimage.gaussian_filter(image, _SPECK))
+
+
+def _speck_depth(
+    residual: Stack, regions: NDArray[np.int32], label: int, place: tuple[slice, ...]
+) -> tuple[tuple[slice, slice], Array | None]:
+    """Return what stands out of the surroundings of a spot in most frames; None where that does not last."""
+    rows, columns = (
+        slice(max(0, s.start - _AROUND), min(size, s.stop + _AROUND))
+        for s, size in zip(place, regions.shape, strict=True)
+    )
+    window, spot = regions[rows, columns], regions[rows, columns] == label
+    ring = ndimage.binary_dilation(spot, iterations=_AROUND) & (window == 0)
+    values = np.nan_to_num(residual[:, rows, columns]).astype(float)
+    x2, x1 = np.meshgrid(*map(_unit, window.shape), indexing="ij")
+    terms = range(_SMOOTH + 1)
+    basis = np.stack([x1**i * x2**j for i in terms for j in terms if i + j <= _SMOOTH], axis=-1)
+    if ring.sum() < 2 * basis.shape[-1]:
+        return (rows, columns), None
+    surfaces = values[:, ring] @ np.linalg.pinv(basis[ring]).T @ basis.reshape(-1, basis.shape[-1]).T
+    depths = values - surfaces.reshape(values.shape)
+    rough = np.mean(depths[:, ring] ** 2, axis=1)
+    # the frames in which no edge of the particle passes by tell the depth
+    depths = depths[rough <= np.median(rough)]
+    depth = np.median(depths, axis=0)
+    share = depths[:, spot] @ depth[spot] / np.sum(depth[spot] ** 2)
+    if np.quantile(share, 0.1) < 0.5 or np.quantile(share, 0.9) > 1.5:
+        return (rows, columns), None
+    return (rows, columns), np.asarray(depth)
+
+
+def _is_tilted(residual: Stack, quiet: Bools, noise: float) -> bool:
+    """Tell whether the light tilts from frame to frame, by more than the noise makes of a steady one."""
+    light = Light.over(quiet, tilted=True)
+    tilts = np.array([light.fit(image)[1:] for image in residual])
+    tilts = tilts[np.isfinite(tilts).all(axis=1)]
+    if len(tilts) < 8:
+        return False
+    spread = 1.4826 * np.median(np.abs(tilts - np.median(tilts, axis=0)), axis=0)
+    error = noise * np.sqrt(np.diag(np.linalg.pinv(light.basis.T @ light.basis)))[1:]
+    return bool((spread > np.maximum(_SIGNIFICANT * error, _TILTED)).any())
