@@ -78,10 +78,10 @@ def _roi(_context: click.Context, _option: click.Parameter, value: str | None) -
 @click.option(
     "--background",
     metavar="FILE|auto|median|surface|border|none",
-    help="The empty field: an image or stack of it, the median in time, a surface fitted to what the particle "
-    "leaves free, a surface through each frame's border, or none.  [default: auto]",
+    help="The empty field: an image or stack of it, the median in time, a surface fitted to what the "
+    "particle leaves free, a surface through each frame's border, or none.  [default: auto]",
 )
-@click.option("--dark", metavar="LEVEL|FILE", help="Pixel value without light, or frames without.  [default: 0]")
+@click.option("--dark", metavar="LEVEL|FILE", help="Pixel value without light, or dark frames.  [default: 0]")
 @click.option(
     "--attenuation",
     is_flag=True,
@@ -200,8 +200,8 @@ def _checked(jobs: Sequence[Job], resume: bool) -> list[Job]:
         if not job.output.parent.is_dir() and job.output == _output_for(job.source):
             checked.append(job)  # there is no input either
             continue
-        refuse_input(job.output, Path(job.source), Path(job.config.preprocess.background))
-        refuse_input(job.output, Path(job.source), Path(job.config.preprocess.dark))
+        preprocess = job.config.preprocess
+        refuse_input(job.output, Path(job.source), Path(preprocess.background), Path(preprocess.dark))
         if resume and job.output.is_file():
             job = replace(job, finished=_is_up_to_date(job))
             if not job.finished and not job.overwrite:
@@ -280,7 +280,7 @@ def _origin(job: Job, frames: Frames) -> dict[str, str]:
 
     preprocess = job.config.preprocess
     given = [] if preprocess.background in BACKGROUNDS else [preprocess.background]
-    if preprocess.dark and not _is_number(preprocess.dark):
+    if preprocess.dark_level is None:
         given.append(preprocess.dark)
     files = frames.info.files
     for path in given * (not preprocess.attenuation):
@@ -288,14 +288,6 @@ def _origin(job: Job, frames: Frames) -> dict[str, str]:
     names = (STANDARD_INPUT if job.source == STANDARD_INPUT else "", *[""] * len(files))
     lines = [provenance.checksum_line(file, name) for file, name in zip(files, names, strict=False)]
     return {"command_line": job.command_line, "inputs": "\n".join(lines)}
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _outcome(job: Job, motion: Motion) -> Outcome:
