@@ -1,4 +1,4 @@
-"""The joint estimate from frames to motion: accuracy, errors that come true, verdicts, frames that are off."""
+"""The joint estimate from frames to motion: accuracy, errors that come true, verdicts, outlying frames."""
 
 from __future__ import annotations
 
