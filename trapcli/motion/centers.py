@@ -173,9 +173,12 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
     for _ in range(3):
         profiles = [_radial_profile(image, noise, radius) for image in images]
         pixels, power = np.sum(profiles, axis=0) if profiles else np.zeros((2, 1))
-        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / np.maximum(pixels, 1))) * noise**2
+        pixels, power = pixels[pixels > 0], power[pixels > 0]
+        if not len(pixels):
+            return farthest
+        least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / pixels)) * noise**2
         # a noise that is a few percent off must not pass for an object as wide as the frame
-        least += np.clip(np.median(power / np.maximum(pixels, 1)), 0, _PLATEAU * noise**2)
+        least += np.clip(np.median(power / pixels), 0, _PLATEAU * noise**2)
         seen = np.flatnonzero(power > least * pixels)
         if not len(seen):
             return farthest
