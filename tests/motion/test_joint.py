@@ -207,34 +207,6 @@ def test_too_few_frames() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("phantom", ["blobs", "grain"])
-@pytest.mark.parametrize("kind", ["tumbling", "single-axis"])
-def test_accuracy_over_seeds(kind: str, phantom: str) -> None:
-    means = []
-    for seed in range(1, 6):
-        images, truth = render(kind, phantom, seed, frames=200, pixels=96)
-        found = estimate(images, truth.time)
-        assert found.identifiable
-        means.append(errors(found, truth).errors["R_aligned"].mean)
-    assert max(means) < 0.5
-
-
-@pytest.mark.slow
-def test_errors_come_true_over_seeds() -> None:
-    names = ("R", "phi", "omega_3", "alpha", "T")
-    within = []
-    for seed in range(1, 11):
-        for kind in ("tumbling", "single-axis"):
-            images, truth = render(kind, "blobs", seed, frames=120, pixels=64)
-            compared = errors(estimate(images, truth.time), truth).errors
-            within.append([(compared[n].within_1_sigma, compared[n].within_2_sigma) for n in names])
-    one, two = np.mean(within, axis=0).T
-    shares = ", ".join(f"{n} {a:.3f} {b:.3f}" for n, a, b in zip(names, one, two, strict=True))
-    assert ((one > 0.6) & (one < 0.76)).all(), shares
-    assert ((two > 0.93) & (two < 0.975)).all(), shares
-
-
-@pytest.mark.slow
 @pytest.mark.skipif(not CELL.exists(), reason="the wave-optics simulation of a cell is not here")
 def test_a_cell_by_wave_optics() -> None:
     """One turn in 220 steps about an axis tilted by 0.2 rad, through light that does not go straight."""
