@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from trapcli.config import PreprocessConfig
-from trapcli.errors import InputError
+from trapcli.errors import ConfigError, InputError
 from trapcli.preprocess.attenuation import to_attenuation
-from trapcli.stack.frames import Frames
+from trapcli.stack.frames import Frames, StackInfo
 from trapcli.stack.tiff import write_tiff
 
 SIZE = 64
@@ -149,3 +149,51 @@ def test_background_shows_the_same_region(moving: np.ndarray, field: np.ndarray,
 def test_missing_background_names_the_file(moving: np.ndarray, field: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"no such place\.tif"):
         attenuation_of(raw(moving, field), "no such place.tif")
+
+
+def test_median_says_that_an_object_stays() -> None:
+    truth = discs(np.random.default_rng(0).normal(scale=0.7, size=(60, 2)))
+    frames = Frames.from_array(raw(truth, np.full((SIZE, SIZE), 30_000.0)))
+    info = to_attenuation(frames, PreprocessConfig(background="median")).info
+    assert "median" in info.notes[0]
+    assert "covers" in info.warnings[0]
+
+
+def test_auto_says_which_background_it_took_and_why(moving: np.ndarray, field: np.ndarray) -> None:
+    info = to_attenuation(Frames.from_array(raw(moving, field)), PreprocessConfig()).info
+    assert info.notes[0].startswith("background: median in time; the particle leaves")
+    assert not info.warnings
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_dark_level_is_taken_off(
+    moving: np.ndarray, field: np.ndarray, tmp_path: Path, as_file: bool
+) -> None:
+    dark = saved(tmp_path / "dark.tif", np.full(field.shape, 2000.0)) if as_file else "2000"
+    background = saved(tmp_path / "empty.tif", field + 2000)
+    config = PreprocessConfig(background=background, dark=dark)
+    found = to_attenuation(Frames.from_array(raw(moving, field) + np.uint16(2000)), config).to_array()
+    assert np.abs(found - moving).max() < 1e-4
+
+
+def test_dark_level_must_be_one(moving: np.ndarray) -> None:
+    frames = Frames.from_array(raw(moving, np.full((SIZE, SIZE), 30_000.0)))
+    with pytest.raises(ConfigError, match="--dark -3"):
+        to_attenuation(frames, PreprocessConfig(dark="-3"))
+    with pytest.raises(InputError, match="nowhere"):
+        to_attenuation(frames, PreprocessConfig(dark="nowhere.tif"))
+
+
+def test_overexposed_frames_are_left_out(moving: np.ndarray) -> None:
+    frames = raw(moving, np.full((SIZE, SIZE), 3000.0), flicker=False)
+    frames[7] = np.minimum(frames[7] * 1.5, 4095)
+    projections = to_attenuation(Frames.from_array(frames, StackInfo(bits=12)), PreprocessConfig())
+    assert np.flatnonzero(np.isnan(projections.to_array()).any(axis=(1, 2))).tolist() == [7]
+    assert "overexposed and left out" in projections.info.warnings[0]
+
+
+def test_a_stack_that_is_overexposed_throughout_is_used_with_a_warning(moving: np.ndarray) -> None:
+    frames = np.minimum(raw(moving, np.full((SIZE, SIZE), 4200.0), flicker=False), 4095)
+    projections = to_attenuation(Frames.from_array(frames, StackInfo(bits=12)), PreprocessConfig())
+    assert "overexposed" in projections.info.warnings[0]
+    assert np.isfinite(projections.to_array()).all()

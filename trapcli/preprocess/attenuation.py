@@ -117,38 +117,52 @@ def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any] | 
 
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
+    sample, overexposed = counts.sample(frames, _FLAGGED)
+    found = _find_background(frames, source, roi, counts, sample)
+    keep = overexposed > 0.5
+    if not overexposed:
+        return found
+    doubt = (
+        "most frames are overexposed, and what is thin can't be measured in them"
+        if keep
+        else f"about {max(0.01, overexposed):.0%} of the frames are overexposed and left out"
+    )
+    return replace(found, warnings=(*found.warnings, doubt), keep_bright=keep)
+
+
+def _find_background(
+    frames: Frames, source: str, roi: tuple[int, ...], counts: Counts, sample: NDArray[np.float32]
+) -> _Background:
     if source == "border":
         return _Background(lambda logs: _border_surface(logs, 2), "background: a surface through the border")
     if source == "none":
         return _Background(lambda logs: _border_surface(logs, 0), "background: none, a flat field")
     if source not in ("auto", "median", "surface"):
         light = mean_image(frames, source, roi, "background") - counts.dark
-        with np.errstate(invalid="ignore", divide="ignore"):
-            field = np.where(light > 0, np.log(light), np.nan)
+        field = np.log(np.where(light > 0, light, np.nan))
         return _Background(_lit(field, Light.over(border(field.shape))), f"background: {source}")
-    sample, overexposed = counts.sample(frames, _FLAGGED)
     fitted = fit_empty_field(sample)
     covered = float(np.mean(fitted.outside < _LEAVES))
-    warnings = ["most frames are overexposed; what is thin can't be measured in them"] if overexposed else []
     if source == "median" or (source == "auto" and covered <= _COVERED):
-        note = (
-            f"background: median in time; the particle leaves {1 - covered:.0%} of the frame most of the time"
-        )
-        if covered > _COVERED:
-            warnings.append(
-                f"the particle covers {covered:.0%} of the frame most of the time, so the median shows it; "
-                "give the background as a file, or take surface"
-            )
-        field = median_field(sample)
-        light_of = Light.over(border(field.shape))
-        return _Background(_lit(field, light_of), note, tuple(warnings), overexposed)
+        return _median(sample, covered)
     note = (
         f"background: a surface of degree {fitted.degree} and {fitted.specks} specks; "
         f"the particle stays over {covered:.0%} of the frame"
     )
-    if (fitted.outside > 0).mean() < _FULL:
-        warnings.append("the particle fills the frame, so its background is a guess; give one as a file")
-    return _Background(_lit(fitted.log_light, fitted.light), note, tuple(warnings), overexposed)
+    unsure = "the particle fills the frame, so its background is a guess; give one as a file"
+    filled = bool((fitted.outside > 0).mean() < _FULL)
+    return _Background(_lit(fitted.log_light, fitted.light), note, (unsure,) * filled)
+
+
+def _median(sample: NDArray[np.float32], covered: float) -> _Background:
+    field = median_field(sample)
+    note = f"background: median in time; the particle leaves {1 - covered:.0%} of the frame most of the time"
+    doubt = (
+        f"the particle covers {covered:.0%} of the frame most of the time, so the median shows it; "
+        "give the background as a file, or take surface"
+    )
+    light = Light.over(border(field.shape))
+    return _Background(_lit(field, light), note, (doubt,) * (covered > _COVERED))
 
 
 def _lit(field: Array, light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:

@@ -79,40 +79,42 @@ class Counts:
         bright = np.asarray(image >= self.highest)
         return LogLight(np.log(np.where(lit, light, dtype.type(step))), ~lit, bright)
 
-    def sample(self, frames: Frames, most_flagged: float) -> tuple[NDArray[np.float32], bool]:
-        """Return logarithms of frames spread over the stack, and whether most of these are overexposed.
+    def sample(self, frames: Frames, most_flagged: float) -> tuple[NDArray[np.float32], float]:
+        """Return logarithms of frames spread over the stack, and how many of these are overexposed.
 
         Parameters
         ----------
         most_flagged:
-            Share of pixels without light beyond which a frame is left out; of bright ones likewise, unless
-            most frames have more.
+            Share of pixels without light beyond which a frame is left out, and of bright ones beyond which
+            it is overexposed and left out unless most frames are.
 
         Returns
         -------
         logs:
-            ``(K, H, W)``, K ≤ 96; NaN in pixels without light or as bright as can be.
+            ``(K, H, W)``, K ≤ 96; NaN in pixels without light, and in bright ones unless most frames are
+            overexposed.
         overexposed:
-            Whether most frames have too many bright pixels.
+            Share of the frames.
         """
         count = min(_SAMPLED, max(_FEWEST, _SAMPLED_BYTES // (4 * frames.shape[1] * frames.shape[2])))
         wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-        logs, shares = [], []
+        logs, bright = [], []
         done = 0
         for block in frames.blocks():
             for image in block[wanted[(wanted >= done) & (wanted < done + len(block))] - done]:
                 light = self.log_light(image, np.dtype(np.float32))
                 if light.dark.mean() <= most_flagged:
-                    logs.append(np.where(light.dark | light.bright, np.float32(np.nan), light.values))
-                    shares.append(float(light.bright.mean()))
+                    logs.append(np.where(light.dark, np.float32(np.nan), light.values))
+                    bright.append(light.bright)
             done += len(block)
         if not logs:
             raise InputError(
                 f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"
             )
-        bright = np.array(shares) > most_flagged
-        overexposed = bool(bright.mean() > 0.5)
-        return np.array(logs)[overexposed | ~bright], overexposed
+        spoilt = np.mean(bright, axis=(1, 2)) > most_flagged
+        if spoilt.mean() > 0.5:
+            return np.array(logs), float(spoilt.mean())
+        return np.where(bright, np.float32(np.nan), logs)[~spoilt], float(spoilt.mean())
 
 
 def mean_image(frames: Frames, path: str, roi: tuple[int, ...], name: str) -> Array:

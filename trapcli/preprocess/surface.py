@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
-from scipy import linalg, ndimage, optimize
+from scipy import ndimage
 
 Array = NDArray[np.float64]
 Stack = NDArray[np.float32]
@@ -24,23 +24,21 @@ _DEGREES = (2, 4, 6)  # of the surface; the one that best foretells the field be
 _PATCH = 5  # edge of the mean in which the particle must stand out [pixels]
 _DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, as a share of its peak
 _CLEAR = 0.8  # the same in standard deviations of a pixel: 4 of the mean over a patch
-_SMALL = 0.1  # share of the particle's area up to which something else is dust
 _MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
 _DIRECT = (
     0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
 )
 _SIGNIFICANT = 4.0  # standard deviations
-_PIXEL = 0.7  # width of the mean that takes away noise [pixels]
 _SPECK = 3.0  # size of a speck [pixels]: what is smoother belongs to the particle or to the surface
-_STEADY = 4.0  # depth of a speck in units of its scatter in time: the particle's own features move
+_STEADY = 3.0  # depth of a speck in units of its scatter in time: the particle's own features move
 _ROUND = 0.3  # least ratio of its curvatures
 _REACH = 5  # farthest that a speck extends from such a place [pixels]
 _FLANK = 0.3  # depth of its flank, as a share of its own
 _RIM = 3  # width by which a speck is larger than what stands out of it [pixels]
 _MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
-_SPARSE = 0.5  # of its standard deviations that a pixel of a speck must improve the fit
 _PARTS = 8  # of the stack, in which a speck must be found
 _AROUND = 5  # width of a speck's surroundings [pixels]
+_SMOOTH = 3  # degree of the particle around a speck
 _FAINTEST = 0.005  # depth of a speck
 _QUIET = 0.95  # share of frames in which a pixel that tells the brightness lies outside of the particle
 _LEAST_QUIET = 0.02  # share of such pixels below which the border has to do
@@ -166,16 +164,15 @@ def fit_empty_field(logs: Stack) -> EmptyField:
     for depth in _DEPTHS:
         residual = light.even(logs - (field + pattern).astype(np.float32))
         outside = _outside(residual, noise, depth)
-        light = Light.over(outside.mean(axis=0) >= _QUIET)
+        quiet = outside.mean(axis=0) >= _QUIET
+        tilted = _is_tilted(logs - (field + pattern).astype(np.float32), quiet, noise)
+        light = Light.over(quiet, tilted=tilted)
         mean, count = _mean_outside(light.even(logs - (field + pattern).astype(np.float32)), outside)
         mean += field + pattern
         degree = _degree(mean, count)
         field = _surface(mean, count, degree)
         pattern, specks = _pattern(light.even(logs - field.astype(np.float32)), mean - field, count, noise)
-    quiet = outside.mean(axis=0) >= _QUIET
-    total = field + pattern
-    tilted = _is_tilted(logs - total.astype(np.float32), quiet, noise)
-    return EmptyField(total, Light.over(quiet, tilted=tilted), outside.mean(axis=0), degree, specks)
+    return EmptyField(field + pattern, light, outside.mean(axis=0), degree, specks)
 
 
 def _unit(size: int) -> Array:
@@ -212,16 +209,8 @@ def _outside(residual: Stack, noise: float, depth: float) -> Bools:
     peak = float(np.median(np.quantile(np.abs(smooth), 0.999, axis=(1, 2))))
     inside = np.abs(smooth) > max(_CLEAR * noise, depth * peak)
     reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
-    grown = [ndimage.maximum_filter(_large(image), reach) for image in inside]
+    grown = [ndimage.maximum_filter(image, reach) for image in inside]
     return ~np.array(grown) & np.isfinite(residual)
-
-
-def _large(mask: Bools) -> Bools:
-    """Return the mask without what is small beside its largest region: dust is not the particle."""
-    labels, _ = ndimage.label(mask)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return np.asarray((sizes > _SMALL * sizes.max())[labels])
 
 
 def _mean_outside(residual: Stack, outside: Bools) -> tuple[Array, Array]:
@@ -265,7 +254,7 @@ def _degree(mean: Array, count: Array) -> int:
     for degree in _DEGREES:
         misfit = np.abs(mean - _surface(mean, np.where(free & ~beside, count, 0), degree))[beside]
         errors.append(float(np.sqrt(np.mean(np.minimum(misfit, 3 * np.median(misfit)) ** 2))))
-    return next(d for d, error in zip(_DEGREES, errors, strict=True) if error <= 1.05 * min(errors))
+    return _DEGREES[int(np.argmin(errors))]
 
 
 def _pattern(residual: Stack, direct: Array, count: Array, noise: float) -> tuple[Array, int]:
@@ -279,34 +268,27 @@ def _pattern(residual: Stack, direct: Array, count: Array, noise: float) -> tupl
     )
     trust = np.where(clear, 1.0, spread / np.maximum(spread + scatter**2, 1e-300))
     pattern = np.where(measured, trust * direct, 0.0)
-    depth, number = _specks(residual)
-    return np.where(measured, pattern, depth), number
+    regions = _speck_regions(residual)
+    number = 0
+    whole = float(np.abs(np.nan_to_num(residual)).sum(dtype=float)) / len(residual)
+    for label, place in enumerate(ndimage.find_objects(regions), start=1):
+        window, depth = _speck_depth(residual, regions, label, place)
+        spot = regions[window] == label
+        # what makes up most of all there is to see is the particle
+        if depth is not None and np.abs(depth[spot]).sum() < _MOST * whole:
+            here = spot & ~measured[window]
+            pattern[window][here] = depth[here]
+            number += 1
+    return pattern, number
 
 
-def _specks(residual: Stack) -> tuple[Array, int]:
-    """Return the depth of sharp spots that stay in place, and their number."""
+def _speck_regions(residual: Stack) -> NDArray[np.int32]:
+    """Label the regions of sharp spots that are in the same place in (almost) all parts of the stack."""
     sharp = np.empty(residual.shape, np.float16)  # holds what is sharp to 1e-3 of it
     for k, image in enumerate(residual):
         sharp[k] = _sharp(np.nan_to_num(image))
     middle = _middle(sharp)
     scatter = _scatter(sharp, middle)
-    depth = np.zeros(middle.shape)
-    regions = _speck_regions(sharp, middle, scatter)
-    whole = float(np.abs(np.nan_to_num(residual)).sum(dtype=float)) / len(residual)
-    number = 0
-    for label, place in enumerate(ndimage.find_objects(regions), start=1):
-        rows, columns = (slice(max(0, side.start - _AROUND), side.stop + _AROUND) for side in place)
-        spot = regions[rows, columns] == label
-        found = _undo_sharpening(middle[rows, columns], scatter[rows, columns], spot)
-        # what makes up most of all there is to see is the particle
-        if np.abs(found).sum() < _MOST * whole:
-            depth[rows, columns] += found
-            number += 1
-    return depth, number
-
-
-def _speck_regions(sharp: NDArray[np.float16], middle: Array, scatter: Array) -> NDArray[np.int32]:
-    """Label the regions of sharp spots that are in the same place in (almost) all parts of the stack."""
     parts = [_middle(part) for part in np.array_split(sharp, min(_PARTS, len(sharp)))]
     depths = np.sort(np.array(parts) * np.sign(middle), axis=0)
     # in one part the particle's edge may hide the speck
@@ -335,30 +317,35 @@ def _scatter(stack: NDArray[np.float16], middle: Array) -> Array:
 
 
 def _sharp(image: Stack) -> Stack:
-    return np.asarray(ndimage.gaussian_filter(image, _PIXEL) - ndimage.gaussian_filter(image, _SPECK))
+    return np.asarray(ndimage.gaussian_filter(image, 0.7) - ndimage.gaussian_filter(image, _SPECK))
 
 
-def _undo_sharpening(middle: Array, scatter: Array, spot: Bools) -> Array:
-    """Return what inside the mask `spot`, all of one sign, looks like `middle` when it is made sharp."""
-    around = np.argwhere(ndimage.binary_dilation(spot, iterations=_AROUND))
-    inside = np.argwhere(spot)
-    square = np.sum((around[:, None] - inside) ** 2, axis=2)
-    kernel = sum(
-        sign * np.exp(-square / (2 * size**2)) / (2 * np.pi * size**2)
-        for sign, size in ((1, _PIXEL), (-1, _SPECK))
+def _speck_depth(
+    residual: Stack, regions: NDArray[np.int32], label: int, place: tuple[slice, ...]
+) -> tuple[tuple[slice, slice], Array | None]:
+    """Return what stands out of the surroundings of a spot in most frames; None where that does not last."""
+    rows, columns = (
+        slice(max(0, s.start - _AROUND), min(size, s.stop + _AROUND))
+        for s, size in zip(place, regions.shape, strict=True)
     )
-    weight = 1 / (scatter + np.median(scatter) + _FAINTEST)[tuple(around.T)]
-    sign = np.sign(np.sum(middle[spot]))
-    design = kernel * weight[:, None]
-    # what is broad hardly shows in `middle`: the least that explains it is taken
-    normal = design.T @ design
-    normal[np.diag_indices_from(normal)] += 1e-6 * np.trace(normal) / len(normal)
-    target = design.T @ (sign * middle[tuple(around.T)] * weight) - _SPARSE * np.sqrt(np.diag(normal))
-    root = np.linalg.cholesky(normal)
-    solution, _ = optimize.nnls(root.T, linalg.solve_triangular(root, target, lower=True))
-    depth = np.zeros(spot.shape)
-    depth[spot] = sign * solution
-    return depth
+    window, spot = regions[rows, columns], regions[rows, columns] == label
+    ring = ndimage.binary_dilation(spot, iterations=_AROUND) & (window == 0)
+    values = np.nan_to_num(residual[:, rows, columns]).astype(float)
+    x2, x1 = np.meshgrid(*map(_unit, window.shape), indexing="ij")
+    terms = range(_SMOOTH + 1)
+    basis = np.stack([x1**i * x2**j for i in terms for j in terms if i + j <= _SMOOTH], axis=-1)
+    if ring.sum() < 2 * basis.shape[-1]:
+        return (rows, columns), None
+    surfaces = values[:, ring] @ np.linalg.pinv(basis[ring]).T @ basis.reshape(-1, basis.shape[-1]).T
+    depths = values - surfaces.reshape(values.shape)
+    rough = np.mean(depths[:, ring] ** 2, axis=1)
+    # the frames in which no edge of the particle passes by tell the depth
+    depths = depths[rough <= np.median(rough)]
+    depth = np.median(depths, axis=0)
+    share = depths[:, spot] @ depth[spot] / np.sum(depth[spot] ** 2)
+    if np.quantile(share, 0.1) < 0.5 or np.quantile(share, 0.9) > 1.5:
+        return (rows, columns), None
+    return (rows, columns), np.asarray(depth)
 
 
 def _is_tilted(residual: Stack, quiet: Bools, noise: float) -> bool:

@@ -1,0 +1,89 @@
+"""A particle that turns in its place, before uneven light with specks: closed form everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from trapcli.preprocess.surface import fit_empty_field
+
+SIZE, FRAMES = 96, 64
+ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] - SIZE // 2
+NOISE = 0.005
+
+
+def ellipse() -> np.ndarray:
+    """Attenuation of an ellipsoid with two inclusions, turning in the middle about the optical axis."""
+    turn = np.linspace(0, 3 * np.pi, FRAMES)[:, None, None]
+    x1 = np.cos(turn) * COLUMNS + np.sin(turn) * ROWS
+    x2 = np.cos(turn) * ROWS - np.sin(turn) * COLUMNS
+    thickness = np.sqrt(np.maximum(1 - (x1 / 30) ** 2 - (x2 / 22) ** 2, 0))
+    for at, size in (((12, 4), 7), ((-9, -6), 9)):
+        thickness += 0.7 * np.sqrt(np.maximum(1 - ((x1 - at[0]) ** 2 + (x2 - at[1]) ** 2) / size**2, 0))
+    return np.asarray(0.3 * thickness)
+
+
+def uneven() -> np.ndarray:
+    x1, x2 = COLUMNS / SIZE * 2, ROWS / SIZE * 2
+    return np.asarray(9.0 + 0.1 * x1 - 0.05 * x2 + np.log(1 - 0.15 * (x1**2 + x2**2)))
+
+
+def speck(row: int, column: int, size: float = 1.5, depth: float = 0.4) -> np.ndarray:
+    square = (ROWS - row) ** 2 + (COLUMNS - column) ** 2
+    return np.asarray(np.log(1 - depth * np.exp(-square / (2 * size**2))))
+
+
+def stack(field: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
+    noise = NOISE * np.random.default_rng(1).standard_normal((FRAMES, SIZE, SIZE))
+    return (field + light - ellipse() + noise).astype(np.float32)
+
+
+def deviation(found: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Return the error but for its mean, which is the brightness of the frames."""
+    free = np.hypot(ROWS, COLUMNS) > 40
+    return np.asarray(found - field - (found - field)[free].mean())
+
+
+def test_smooth_light_is_carried_on_under_the_particle() -> None:
+    flicker = 0.05 * np.sin(7 * np.arange(FRAMES))[:, None, None]
+    found = fit_empty_field(stack(uneven(), flicker))
+    assert np.abs(deviation(found.log_light, uneven())).max() < 0.5 * NOISE
+    assert found.outside[SIZE // 2, SIZE // 2] == 0
+    assert found.outside[:5].min() == 1
+
+
+@pytest.mark.parametrize("place", [(0, 3), (14, -10), (-33, -33)], ids=["middle", "inside", "outside"])
+def test_specks_are_found_under_the_particle_and_beside_it(place: tuple[int, int]) -> None:
+    field = uneven() + speck(*place)
+    found = fit_empty_field(stack(field))
+    assert found.specks == 1
+    error = deviation(found.log_light, field)
+    around = np.hypot(ROWS - place[0], COLUMNS - place[1]) < 9
+    assert abs(error[around].sum()) < 0.1 * abs(speck(*place).sum())
+    assert np.abs(error).max() < 0.1 * np.abs(speck(*place)).max()
+
+
+def test_the_particle_itself_is_no_speck() -> None:
+    assert fit_empty_field(stack(uneven())).specks == 0
+
+
+def test_steady_light_is_not_tilted() -> None:
+    assert len(fit_empty_field(stack(uneven())).light.surface) == 1
+
+
+def test_light_that_tilts_is_followed() -> None:
+    frames = stack(uneven(), 0.02 * np.sin(np.arange(FRAMES) / 5)[:, None, None] * COLUMNS / (SIZE / 2))
+    found = fit_empty_field(frames)
+    assert len(found.light.surface) == 3
+    evened = found.light.even(frames - found.log_light.astype(np.float32))
+    free = np.hypot(ROWS, COLUMNS) > 40
+    slopes = evened[:, free] @ COLUMNS[free] / np.sum(COLUMNS[free] ** 2)
+    assert np.abs(slopes).max() * SIZE / 2 < 0.001
+
+
+def test_pixels_that_tell_nothing_do_no_harm() -> None:
+    frames = stack(uneven())
+    frames[:, 3:6, 40:44] = np.nan
+    frames[5, 50:60, 50:60] = np.nan
+    found = fit_empty_field(frames)
+    assert np.abs(deviation(found.log_light, uneven())).max() < 0.6 * NOISE
