@@ -3,18 +3,24 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+TOOLS  := $(VENV)/.tools
 TRAP   := ../$(BIN)/trap-motion
 
 # the tests' matrices are small, and several processes run at once
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test slow lint setup bench clean
+.PHONY: demo test slow lint docs setup bench clean
 
 setup: $(STAMP)
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	@touch $@
+
+# what only tests, checks and documentation need: a first result shouldn't wait for it
+$(TOOLS): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint,docs]'
 	@touch $@
 
 # the paper's example: a stack with its true motion, both methods, errors and figures
@@ -29,20 +35,24 @@ demo: $(STAMP)
 	cd demo && $(TRAP) plot auto.h5 --truth truth.h5 --stack sim.tif
 	@echo "Done: look at demo/paper.png and demo/auto.png."
 
-test: $(STAMP)
+test: $(TOOLS)
 	$(BIN)/python -m pytest -m "not slow" -n 2
 
-slow: $(STAMP)
+slow: $(TOOLS)
 	$(BIN)/python -m pytest -m slow
 
-lint: $(STAMP)
+lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# the pages of docs/ as a site: open site/index.html
+docs: $(TOOLS)
+	$(BIN)/mkdocs build --strict --quiet
 
 # the table of docs/benchmarks-paper.md
 bench: $(STAMP)
 	$(BIN)/python benchmarks/paper_table.py
 
 clean:
-	rm -rf demo $(VENV) build *.egg-info
+	rm -rf demo site $(VENV) build *.egg-info

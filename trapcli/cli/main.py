@@ -13,7 +13,7 @@ import click
 from trapcli.cli.options import say
 from trapcli.errors import ConfigError, OutputError, TrapError
 
-COMMANDS = ("simulate", "estimate", "compare", "plot", "export", "info")
+COMMANDS = ("simulate", "estimate", "compare", "plot", "report", "reconstruct", "align", "export", "info")
 FAULT = 1
 INTERRUPTED = 130
 

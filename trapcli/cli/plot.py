@@ -11,7 +11,6 @@ import click
 from trapcli.cli.options import PATH, Console, console_options, overwrite_option, print_path, refuse_input
 
 if TYPE_CHECKING:
-    from trapcli.report.figures import Projection
     from trapcli.result.motion import Motion
 
 PROJECTIONS = 4
@@ -52,6 +51,7 @@ def command(
     from trapcli.atomic import atomic_path, check_output
     from trapcli.errors import ConfigError, InputError
     from trapcli.report import figures
+    from trapcli.report.projections import choose, read_projections
     from trapcli.result.motion import Motion
 
     output = output or result.with_suffix(".png")
@@ -62,7 +62,8 @@ def command(
     check_output(output, overwrite)
     motion = Motion.load(result)
     exact = Motion.load(truth) if truth else None
-    projections = _read_projections(stack, motion, steps) if stack else ()
+    shown = steps or motion.frame[choose(motion, PROJECTIONS)].tolist()
+    projections = read_projections(stack, motion, shown) if stack else ()
     _note_missing(motion, steps, console)
     try:
         figure = figures.draw(motion, truth=exact, projections=projections, steps=steps, title=result.name)
@@ -71,32 +72,6 @@ def command(
     with atomic_path(output, overwrite) as temporary:
         figures.save(figure, temporary, suffix)
     print_path(output)
-
-
-def _read_projections(stack: str, motion: Motion, steps: Sequence[int]) -> list[Projection]:
-    """Read the chosen frames as the result's own configuration did (region, channel, pixel size)."""
-    import dataclasses
-    import tomllib
-
-    import numpy as np
-
-    from trapcli.config import InputConfig, from_dict
-    from trapcli.errors import InputError
-    from trapcli.report.figures import Projection
-    from trapcli.stack import open_stack
-
-    stored = tomllib.loads(motion.provenance.get("configuration", "")).get("input", {})
-    config = from_dict(InputConfig, stored, "configuration in the result")
-    chosen = steps or motion.frame[np.linspace(0, len(motion) - 1, PROJECTIONS).round().astype(int)].tolist()
-    projections = []
-    for frame in dict.fromkeys(chosen):
-        try:
-            frames = open_stack(stack, dataclasses.replace(config, frames=f"{frame}:{frame + 1}"))
-        except InputError as error:
-            raise InputError(f"frame {frame} can't be shown: {error}") from None
-        size = 1.0 if motion.length_unit == "pixel" else frames.info.pixel_size
-        projections.append(Projection(int(frame), frames.to_array()[0], size))
-    return projections
 
 
 def _note_missing(motion: Motion, steps: Sequence[int], console: Console) -> None:

@@ -1,7 +1,8 @@
 """The figures of the paper's section Numerics for one result (Elbau et al. 2020, Inverse Problems 36).
 
-Projections with the tracked centre (``fig:projections``), translation (``fgRecCenter``), Φ (``fgResidual``),
-φ and ω₃ (``fgRecAngle``), α (``fgRecAlpha``) and, with a truth, the errors (``fgRecErrors``).
+Projections with the tracked centre and the rotation axis (``fig:projections``), translation
+(``fgRecCenter``), Φ (``fgResidual``), φ and ω₃ (``fgRecAngle``), α (``fgRecAlpha``) and, with a truth, the
+errors (``fgRecErrors``); for the page of `trapcli.report.html` also residual, flags and checks.
 """
 
 from __future__ import annotations
@@ -11,26 +12,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.gridspec import GridSpec
+from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Circle, Patch
 from numpy.typing import NDArray
 
+from trapcli.report.checks import FrameChecks
 from trapcli.result.comparison import Matched, match, wrap
-from trapcli.result.motion import Array, Motion
+from trapcli.result.motion import FLAG_MEANINGS, Array, Flag, Motion
 
 FORMATS = (".png", ".pdf", ".svg")
 
 _RESULT, _RESULT_2 = "#1f4fa8", "#3aa0c9"
 _TRUTH = "#d1332e"
+_AXIS = "#e0831a"
+_AXIS_LENGTH = 0.35
+"""Of a rotation axis that lies in the image plane, to either side, as a share of the shorter edge."""
 _ERRORS = {"phi": ("φ", "x", _RESULT), "omega_3": ("ω₃", "^", "#e0831a"), "alpha": ("α", "s", "#2a8c4a")}
 _BAND = 0.22
 _INVALID, _SHADE = "#b8b8b8", 0.35
@@ -129,7 +134,7 @@ def draw(
         ratios = [1.25] * extra + [1.0] * rows
         grid = GridSpec(rows + extra, 2, figure=figure, height_ratios=ratios)
         if projections:
-            _draw_projections(figure, grid, projections, motion, exact)
+            _draw_projections(figure, grid[0, :], projections, motion, exact)
         for i, panel in enumerate(panels):
             alone = i == len(panels) - 1 and i % 2 == 0
             panel(figure.add_subplot(grid[extra + i // 2, slice(None) if alone else i % 2]))
@@ -138,7 +143,71 @@ def draw(
     return figure
 
 
-def save(figure: Figure, path: Path, suffix: str) -> None:
+def draw_frames(motion: Motion, *rows: Sequence[Projection]) -> Figure:
+    """Draw rows of frames, each with one grey scale, the tracked centre and the rotation axis.
+
+    The axis is a line through the centre, as long as a rod along it appears in the image: it reaches the
+    dotted circle where it lies in the image plane, and is a point where it is the optical axis.
+    """
+    motion = _drawable(motion)
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 3.1 * len(rows)), layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08))
+        FigureCanvasAgg(figure)
+        grid = GridSpec(len(rows), 1, figure=figure)
+        for i, projections in enumerate(rows):
+            _draw_projections(figure, grid[i], projections, motion, None)
+    return figure
+
+
+def draw_quality(motion: Motion) -> Figure:
+    """Draw the residual of each frame, and below it a row of marks for every flag that occurs."""
+    present = [(flag, words) for flag, words in FLAG_MEANINGS.items() if (motion.flags & int(flag)).any()]
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 3.0 + 0.3 * len(present)), layout=ConstrainedLayoutEngine())
+        FigureCanvasAgg(figure)
+        ratios = [3.0, 0.1 + 0.3 * len(present)] if present else [1.0]
+        grid = GridSpec(len(ratios), 1, figure=figure, height_ratios=ratios)
+        axes = figure.add_subplot(grid[0])
+        _shade_invalid(axes, motion)
+        residual = np.where(np.abs(motion.residual) < _HUGE, motion.residual, np.nan)
+        many = len(motion) > _POINTS
+        axes.plot(motion.time, residual, "," if many else ".", color=_RESULT, ms=4, rasterized=many)
+        marked = (motion.flags > 0) | (motion.valid == 0)
+        axes.plot(motion.time[marked], residual[marked], "o", color=_TRUTH, ms=5, mfc="none", rasterized=many)
+        axes.set_title("residual: relative misfit of each frame, flagged frames circled")
+        _finish(axes, motion, "", residual, None)
+        if present:
+            _draw_flags(figure.add_subplot(grid[1], sharex=axes), motion, present)
+    return figure
+
+
+def draw_checks(motion: Motion, checks: FrameChecks) -> Figure:
+    """Draw total attenuation, border and noise of each frame, with what the noise alone would give."""
+    with matplotlib.rc_context(_STYLE):
+        figure = Figure(figsize=(11, 2.9), layout=ConstrainedLayoutEngine(w_pad=0.08))
+        FigureCanvasAgg(figure)
+        grid = GridSpec(1, 3, figure=figure)
+        for i, (title, values, ideal, noise) in enumerate(
+            (
+                ("total attenuation", checks.mass, 1.0, checks.mass_noise),
+                ("border, of the peak", checks.border, 0.0, checks.border_noise),
+                ("pixel noise, of the peak", checks.noise, None, 0.0),
+            )
+        ):
+            axes = figure.add_subplot(grid[i])
+            if ideal is not None:
+                axes.axhspan(ideal - noise, ideal + noise, color=_INVALID, alpha=_SHADE, lw=0)
+                axes.axhline(ideal, color=_INVALID, lw=1)
+            axes.plot(motion.time, values, "-", color=_RESULT, lw=0.8, rasterized=len(motion) > _POINTS)
+            axes.set_title(title)
+            axes.set_xlabel(_time_label(motion))
+            if ideal is None:
+                axes.set_ylim(bottom=0)
+            _limit_time(axes, motion)
+    return figure
+
+
+def save(figure: Figure, path: Path | IO[bytes], suffix: str) -> None:
     """Write a figure as ``.png``, ``.pdf`` or ``.svg``, without a date: equal figures are equal files."""
     dates: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}, ".png": {}}
     with matplotlib.rc_context(_STYLE):
@@ -275,11 +344,11 @@ def _draw_landscape(axes: Axes, shown: Motion, exact: Motion | None, steps: Sequ
 
 
 def _draw_projections(
-    figure: Figure, grid: GridSpec, projections: Sequence[Projection], shown: Motion, exact: Motion | None
+    figure: Figure, place: SubplotSpec, projections: Sequence[Projection], shown: Motion, exact: Motion | None
 ) -> None:
-    inner = grid[0, :].subgridspec(1, len(projections))
-    low = min(float(np.nanmin(p.image)) for p in projections)
-    high = max(float(np.nanmax(p.image)) for p in projections)
+    inner = place.subgridspec(1, len(projections))
+    known = np.concatenate([p.image[np.isfinite(p.image)] for p in projections])
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     for i, projection in enumerate(projections):
         axes = figure.add_subplot(inner[i])
         height, width = projection.image.shape
@@ -298,6 +367,7 @@ def _draw_projections(
         if len(at):
             axes.set_title(_moment(shown, int(at[0])))
         if len(at) and projection.pixel_size:
+            _draw_axis(axes, shown, int(at[0]), _AXIS_LENGTH * size * min(height, width))
             _draw_center(axes, shown, exact, int(at[0]))
         axes.set_xlim(extent[:2])
         axes.set_ylim(extent[2:])
@@ -310,6 +380,25 @@ def _draw_center(axes: Axes, shown: Motion, exact: Motion | None, at: int) -> No
     if exact:
         true = exact.center[exact.frame == shown.frame[at]]
         axes.plot(*true.T, "o", color=_TRUTH, ms=11, mew=1.2, mfc="none")
+
+
+def _draw_axis(axes: Axes, shown: Motion, at: int, length: float) -> None:
+    """Draw the rotation axis as a rod of this half length appears in the image."""
+    phi, in_plane = shown.phi[at], shown.alpha[at] / np.hypot(shown.alpha[at], shown.omega_3[at] or 1e-300)
+    if not np.isfinite(phi + in_plane):
+        return
+    end = length * in_plane * np.array([np.cos(phi), np.sin(phi)])
+    axes.plot(*np.stack([shown.center[at] - end, shown.center[at] + end]).T, "-", color=_AXIS, lw=1.6)
+    axes.add_patch(Circle(shown.center[at], length, fill=False, color=_AXIS, lw=0.8, ls=":"))
+
+
+def _draw_flags(axes: Axes, motion: Motion, present: Sequence[tuple[Flag, str]]) -> None:
+    for row, (flag, _) in enumerate(present):
+        at = motion.time[(motion.flags & int(flag)) > 0]
+        axes.plot(at, np.full(len(at), row), "|", color=_TRUTH, ms=9, rasterized=len(at) > _POINTS)
+    axes.set_yticks(range(len(present)), [words.split(":")[0] for _, words in present])
+    axes.set_ylim(len(present) - 0.5, -0.5)
+    axes.set_xlabel(_time_label(motion))
 
 
 def _draw_heading(figure: Figure, motion: Motion, title: str) -> None:
