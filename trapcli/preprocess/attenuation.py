@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,13 +35,14 @@ class _Background:
 
     Attributes
     ----------
-    log_light:
-        Gives ``(H, W)`` log I₀ for the logarithm of one frame's light; NaN where it isn't known.
+    attenuation:
+        Gives ``(H, W)`` log I₀ − log I for the logarithm of one frame's light, which it may overwrite; NaN
+        where I₀ isn't known.
     keep_bright:
         Whether overexposed frames are kept, because most are.
     """
 
-    log_light: Callable[[NDArray[Any]], NDArray[Any]]
+    attenuation: Callable[[NDArray[Any]], NDArray[Any]]
     note: str
     warnings: tuple[str, ...] = ()
     keep_bright: bool = False
@@ -84,16 +86,21 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     background = _background(frames, config.background, roi, counts)
     dtype = np.dtype(np.float64 if frames.dtype == np.float64 else np.float32)
 
+    def projection(image: NDArray[Any]) -> tuple[NDArray[Any], bool]:
+        """Return one projection, NaN where the frame is spoilt, and whether light is missing."""
+        light = counts.log_light(image, dtype)
+        spoilt = light.dark if background.keep_bright else light.dark | light.bright
+        if _share(spoilt) > _FLAGGED:
+            return np.full(image.shape, np.nan, dtype), _share(light.dark) > _FLAGGED
+        return _attenuation(light.values, background).astype(dtype, copy=False), False
+
     def read_blocks(size: int) -> Iterator[NDArray[Any]]:
         dark = 0
         for block in frames.read_blocks(size):
-            projections = np.full(block.shape, np.nan, dtype)
-            for image, projection in zip(block, projections, strict=True):
-                light = counts.log_light(image, dtype)
-                dark += int(light.dark.mean() > _FLAGGED)
-                spoilt = light.dark if background.keep_bright else light.dark | light.bright
-                if spoilt.mean() <= _FLAGGED:
-                    projection[:] = _attenuation(light.values, background)
+            projections = np.empty(block.shape, dtype)
+            for n, image in enumerate(block):
+                projections[n], is_dark = projection(image)
+                dark += is_dark
             if dark > len(frames) / 2:
                 raise InputError(
                     f"{frames.info.source}: most frames have pixels of 0 or less, which have no logarithm; "
@@ -101,19 +108,28 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
                 )
             yield projections
 
+    def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[Any]]:
+        return (projection(image)[0] for image in frames.pick(positions))
+
     info = replace(
         frames.info,
         notes=(*frames.info.notes, background.note),
         warnings=(*frames.info.warnings, *background.warnings),
     )
-    return replace(frames, dtype=dtype, read_blocks=read_blocks, info=info)
+    return replace(frames, dtype=dtype, read_blocks=read_blocks, read_some=read_some, info=info)
 
 
-def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any] | float:
+def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any]:
     """Return log I₀ − log I, 0 in pixels of unknown background; NaN where that is unknown in most."""
-    attenuation = background.log_light(logs) - logs
+    attenuation = background.attenuation(logs)
     unknown = np.isnan(attenuation)
-    return np.nan if unknown.mean() > 0.5 else np.where(unknown, 0.0, attenuation)
+    if unknown.any():
+        attenuation[unknown] = np.nan if _share(unknown) > 0.5 else 0.0
+    return attenuation
+
+
+def _share(mask: NDArray[np.bool_]) -> float:
+    return np.count_nonzero(mask) / mask.size
 
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
@@ -134,9 +150,9 @@ def _find_background(
     frames: Frames, source: str, roi: tuple[int, ...], counts: Counts, sample: NDArray[np.float32]
 ) -> _Background:
     if source == "border":
-        return _Background(lambda logs: _border_surface(logs, 2), "background: a surface through the border")
+        return _Background(partial(_above_border, degree=2), "background: a surface through the border")
     if source == "none":
-        return _Background(lambda logs: _border_surface(logs, 0), "background: none, a flat field")
+        return _Background(partial(_above_border, degree=0), "background: none, a flat field")
     if source not in ("auto", "median", "surface"):
         light = mean_image(frames, source, roi, "background") - counts.dark
         field = np.log(np.where(light > 0, light, np.nan))
@@ -166,13 +182,19 @@ def _median(sample: NDArray[np.float32], covered: float) -> _Background:
 
 
 def _lit(field: Array, light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:
-    """Return the background as bright as each frame."""
+    """Return the attenuation before a background as bright as each frame."""
+    single = field.astype(np.float32)
 
-    def log_light(logs: NDArray[Any]) -> NDArray[Any]:
-        empty = field.astype(logs.dtype)
-        return np.asarray(empty + light.of(light.fit(logs - empty), empty.shape).astype(logs.dtype))
+    def attenuation(logs: NDArray[Any]) -> NDArray[Any]:
+        ratio: NDArray[Any] = np.subtract(single if logs.dtype == np.float32 else field, logs, out=logs)
+        ratio -= light.of(light.fit(ratio), ratio.shape)
+        return ratio
 
-    return log_light
+    return attenuation
+
+
+def _above_border(logs: NDArray[Any], degree: int) -> NDArray[Any]:
+    return np.asarray(_border_surface(logs, degree) - logs)
 
 
 def _border_surface(logs: NDArray[Any], degree: int) -> Array:

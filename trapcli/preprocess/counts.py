@@ -73,10 +73,12 @@ class Counts:
 
     def log_light(self, image: NDArray[Any], dtype: np.dtype[Any]) -> LogLight:
         """Return log(image − dark)."""
-        step = 0.5 if image.dtype.kind in "iub" else _smallest(image - self.dark)
         light = np.asarray(image, dtype=dtype) - np.asarray(self.dark, dtype=dtype)
-        lit = np.isfinite(light) & (light > 0)
         bright = np.asarray(image >= self.highest)
+        if light.min() > 0 and light.max() < math.inf:
+            return LogLight(np.log(light, out=light), np.zeros(light.shape, bool), bright)
+        step = 0.5 if image.dtype.kind in "iub" else _smallest(image - self.dark)
+        lit = np.isfinite(light) & (light > 0)
         return LogLight(np.log(np.where(lit, light, dtype.type(step))), ~lit, bright)
 
     def sample(self, frames: Frames, most_flagged: float) -> tuple[NDArray[np.float32], float]:
@@ -99,14 +101,11 @@ class Counts:
         count = min(_SAMPLED, max(_FEWEST, _SAMPLED_BYTES // (4 * frames.shape[1] * frames.shape[2])))
         wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
         logs, bright = [], []
-        done = 0
-        for block in frames.blocks():
-            for image in block[wanted[(wanted >= done) & (wanted < done + len(block))] - done]:
-                light = self.log_light(image, np.dtype(np.float32))
-                if light.dark.mean() <= most_flagged:
-                    logs.append(np.where(light.dark, np.float32(np.nan), light.values))
-                    bright.append(light.bright)
-            done += len(block)
+        for image in frames.pick(wanted):
+            light = self.log_light(image, np.dtype(np.float32))
+            if light.dark.mean() <= most_flagged:
+                logs.append(np.where(light.dark, np.float32(np.nan), light.values))
+                bright.append(light.bright)
         if not logs:
             raise InputError(
                 f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"

@@ -67,6 +67,9 @@ class Frames:
     read_blocks:
         ``read_blocks(size)`` starts a new pass and yields consecutive ``(n, H, W)`` blocks, n ≤ size. Passes
         may be repeated. Raises `InputError` where fewer than N frames can be delivered.
+    read_some:
+        ``read_some(positions)`` yields the ``(H, W)`` frames at ascending positions without reading the
+        others; None where that can't be done.
     """
 
     shape: tuple[int, int, int]
@@ -74,6 +77,9 @@ class Frames:
     index: NDArray[np.int64]
     info: StackInfo
     read_blocks: Callable[[int], Iterator[NDArray[np.generic]]] = field(repr=False)
+    read_some: Callable[[NDArray[np.integer[Any]]], Iterator[NDArray[np.generic]]] | None = field(
+        default=None, repr=False
+    )
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -84,6 +90,16 @@ class Frames:
             frame_bytes = self.shape[1] * self.shape[2] * self.dtype.itemsize
             size = max(1, min(len(self), (16 << 20) // max(1, frame_bytes)))
         return self.read_blocks(size)
+
+    def pick(self, positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[np.generic]]:
+        """Yield the ``(H, W)`` frames at ascending positions 0 … N−1."""
+        if self.read_some is not None:
+            yield from self.read_some(positions)
+            return
+        done = 0
+        for block in self.blocks():
+            yield from block[positions[(positions >= done) & (positions < done + len(block))] - done]
+            done += len(block)
 
     def to_array(self) -> NDArray[np.generic]:
         """Return all frames as one ``(N, H, W)`` array (for small stacks and tests)."""
@@ -97,8 +113,12 @@ class Frames:
             for start in range(0, len(frames), size):
                 yield frames[start : start + size]
 
+        def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[np.generic]]:
+            return (frames[position] for position in positions)
+
         n, height, width = frames.shape
-        return cls((n, height, width), frames.dtype, np.arange(n), info or StackInfo(), read_blocks)
+        info = info or StackInfo()
+        return cls((n, height, width), frames.dtype, np.arange(n), info, read_blocks, read_some)
 
 
 def single_frames(

@@ -105,24 +105,32 @@ def select(source: Source, config: InputConfig) -> Frames:
     rows, columns = _region(source, config.roi)
     channel = _channel(source, config.channel)
 
+    def read(wanted: NDArray[np.int64]) -> Generator[NDArray[Any]]:
+        frames = source.read(wanted, channel)
+        for position in wanted:
+            with guard(source.name):
+                frame = next(frames, None)
+            if frame is None:
+                raise InputError(f"{source.name}: frame {position} can't be read; {PARTIAL_HINT}")
+            yield _grey(source, frame[rows, columns])
+
     def read_blocks(size: int) -> Generator[NDArray[Any]]:
-        frames = source.read(index, channel)
+        frames = read(index)
         for start in range(0, len(index), size):
             shape = (min(size, len(index) - start), rows.stop - rows.start, columns.stop - columns.start)
             block = np.empty(shape, source.dtype)
-            for row, position in zip(block, index[start:], strict=False):
-                with guard(source.name):
-                    frame = next(frames, None)
-                if frame is None:
-                    raise InputError(f"{source.name}: frame {position} can't be read; {PARTIAL_HINT}")
-                row[...] = _grey(source, frame[rows, columns])
+            for row, frame in zip(block, frames, strict=False):
+                row[...] = frame
             yield block
+
+    def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[Any]]:
+        return (frame.copy() for frame in read(index[positions]))
 
     # an unreadable codec or unequal colours are found here rather than halfway through
     with closing(read_blocks(1)) as first:
         next(first)
     shape = (len(index), rows.stop - rows.start, columns.stop - columns.start)
-    return Frames(shape, source.dtype, index, calibrated(source.info, config), read_blocks)
+    return Frames(shape, source.dtype, index, calibrated(source.info, config), read_blocks, read_some)
 
 
 def _frame_slice(text: str) -> slice:
