@@ -27,3 +27,9 @@ class OutputError(TrapError):
     """An output exists already or can't be written."""
 
     exit_code = 5
+
+
+class UntrustedError(TrapError):
+    """A result says of itself that it can't be trusted, and nobody asked to use it nevertheless."""
+
+    exit_code = 4

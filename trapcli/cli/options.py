@@ -104,6 +104,28 @@ def console_options(command: Function) -> Function:
     return wrapper  # type: ignore[return-value]
 
 
+def preparing_options(command: Function) -> Function:
+    """Add what decides how the frames of a result are prepared, see `trapcli.reconstruction.prepare`."""
+    for option in reversed(
+        (
+            click.option(
+                "--attenuation",
+                is_flag=True,
+                default=None,
+                help="The frames are attenuation projections already.",
+            ),
+            click.option("--background", metavar="FILE|...", help="Another empty field than the estimate's."),
+            click.option("--dark", metavar="LEVEL|FILE", help="Another pixel value without light."),
+            click.option(
+                "--pixel-size", type=float, metavar="P", help="Edge of a pixel in the result's unit."
+            ),
+            click.option("--untrusted", is_flag=True, help="Use a motion even if its verdict is against it."),
+        )
+    ):
+        command = option(command)
+    return command
+
+
 def resolve_config(cls: type[C], file: Path | None, options: dict[str, Any]) -> C:
     """Fill the configuration dataclass `cls`: an option beats the file, the file beats the default.
 

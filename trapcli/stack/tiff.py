@@ -100,6 +100,35 @@ def write_tiff(
         )
 
 
+def write_volume_tiff(
+    path: Path | str, values: NDArray[Any], *, voxel_size: float, unit: str, overwrite: bool = False
+) -> None:
+    """Write a volume of cubic voxels as OME-TIFF, its slices along the first axis.
+
+    Parameters
+    ----------
+    values:
+        ``(n3, n2, n1)``, ``[x3, x2, x1]``.
+    voxel_size, unit:
+        Edge of a voxel; ``pixel`` where the unit is not known.
+
+    Raises
+    ------
+    OutputError
+        Where `path` exists (without `overwrite`) or can't be written.
+    """
+    arguments = _ome_arguments(values.shape, None, voxel_size, unit if unit != "pixel" else None)
+    metadata = arguments["metadata"] | {"axes": "ZYX"}
+    for name in ("PhysicalSizeZ", "PhysicalSizeZUnit"):
+        metadata[name] = metadata[name.replace("Z", "X", 1)]
+    large = values.nbytes >= CLASSIC_TIFF_LIMIT
+    with (
+        atomic_path(path, overwrite) as temporary,
+        tifffile.TiffWriter(temporary, bigtiff=large, imagej=False, ome=True) as tiff,
+    ):
+        tiff.write(values, photometric="minisblack", metadata=metadata)
+
+
 def _imagej_arguments(
     _shape: tuple[int, int, int],
     frame_interval: float | None,

@@ -1,0 +1,1 @@
+"""The object itself, from frames whose motion is known."""
