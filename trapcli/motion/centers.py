@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import rfft2
 from scipy.ndimage import uniform_filter
 
+from trapcli.motion.cells import Cells
 from trapcli.motion.time_derivatives import choose_filters
 from trapcli.stack.frames import Frames
 
@@ -26,6 +28,8 @@ TAPER = 1.2
 """Radius at which the weight has fallen to 0, in radii of the object."""
 
 _SURVEY = 32  # frames that the noise and the radius are measured on
+_FEWEST = 8
+_SURVEY_BYTES = 128 << 20  # that they may take
 _RING = 2.0  # width of the rings of the radial profile [pixels]
 _VISIBLE = 0.06  # least power of a ring that counts as object, in units of the noise's
 _PLATEAU = 0.2  # power of the empty field beyond the noise's, in its units, that may be a misjudged noise
@@ -33,6 +37,8 @@ _COARSE = 256  # pixels across on which the radius is measured
 _SIGNIFICANT = 5.0  # standard deviations
 _BLANK = 0.02  # share of the median mass below which a frame holds no object
 _CLIPPED = 0.01  # mean attenuation on one side of the frame, as a share of the frame's highest
+_SPARSE = 4  # of so many rows and columns one tells what the empty field is like roughly
+_ROUGH = 0.02  # error of the centre, in radii of the object, at which that level is measured
 _OUTSIDE = 0.1  # share of the frame outside the object's disc that tells the level of the empty field
 _CONVERGED = 1e-9  # step that ends the iteration [pixels]
 _FINE = 0.01  # or in units of the error that the noise makes
@@ -86,52 +92,89 @@ def estimate_centers(
     survey = sample_frames(attenuation)
     noise = pixel_noise(survey)
     radius = object_radius(survey, noise)
-    n = len(attenuation)
-    center = np.full((n, 2), np.nan)
-    mass, level, clipped = np.zeros(n), np.zeros(n), np.zeros(n, bool)
-    done = 0
-    previous: Array | None = None
+    tracker = Tracker(len(attenuation), noise, radius)
     for block in attenuation.blocks():
         for image in block:
-            found = _find(image, noise, radius, previous)
-            if found is not None:
-                previous, mass[done], level[done] = found
-                center[done] = previous
-                clipped[done] = _touches_edge(image, noise, level[done])
-            done += 1
+            tracker.follow(image)
         if progress is not None:
-            progress("centers", done, n)
-    if (mass > 0).any():
-        faint = mass < _BLANK * np.median(mass[mass > 0])
-        center[faint], mass[faint] = np.nan, 0.0
-    center, errors = _smooth(center, mass, noise * _lever(attenuation.shape[1:], radius))
-    return Centers(
-        center=center * pixel_size,
-        errors=errors * pixel_size,
-        mass=mass * pixel_size**2,
-        level=level,
-        noise=noise,
-        radius=radius * pixel_size,
-        clipped=clipped,
-    )
+            progress("centers", tracker.done, len(attenuation))
+    return tracker.centers(attenuation.shape[1:], pixel_size)
+
+
+class Tracker:
+    """Finds the object in one frame after the other.
+
+    Parameters
+    ----------
+    count:
+        Number of frames N.
+    noise, radius:
+        Standard deviation of the noise of one pixel, and radius of the object [pixels], of the frames that
+        `follow` gets.
+    """
+
+    def __init__(self, count: int, noise: float, radius: float) -> None:
+        self.done = 0
+        self.place = np.full((count, 2), np.nan)
+        self.level = np.zeros(count)
+        self._mass, self._clipped = np.zeros(count), np.zeros(count, bool)
+        self._noise, self._radius = noise, radius
+        self._previous: _Found | None = None
+
+    def follow(self, image: NDArray[Any]) -> bool:
+        """Find the object in the next frame, ``(H, W)``; tell whether it is there."""
+        n = self.done
+        self.done += 1
+        found = _find(image, self._noise, self._radius, self._previous)
+        if found is None:
+            return False
+        self._previous = found
+        self.place[n], self._mass[n], self.level[n] = found.center, found.mass, found.level
+        self._clipped[n] = _touches_edge(image, self._noise, found.level)
+        return True
+
+    def centers(self, shape: tuple[int, ...], pixel_size: float, cells: Cells | None = None) -> Centers:
+        """Return what was found in all frames of ``(H, W)`` `shape`, smoothed in time.
+
+        Parameters
+        ----------
+        cells:
+            What the frames were averaged to; None: not at all.
+        """
+        cells = cells or Cells(shape)
+        place, mass = cells.to_pixels(self.place), self._mass * cells.binning**2
+        if (mass > 0).any():
+            faint = mass < _BLANK * np.median(mass[mass > 0])
+            place[faint], mass[faint] = np.nan, 0.0
+        noise, radius = self._noise * cells.binning, self._radius * cells.binning
+        center, errors = _smooth(place, mass, noise * _lever(shape, radius))
+        return Centers(
+            center=center * pixel_size,
+            errors=errors * pixel_size,
+            mass=mass * pixel_size**2,
+            level=self.level,
+            noise=noise,
+            radius=radius * pixel_size,
+            clipped=self._clipped,
+        )
 
 
 def sample_frames(frames: Frames, count: int = _SURVEY) -> NDArray[Any]:
-    """Return at most `count` frames without NaN, spread evenly over the stack, ``(K, H, W)``."""
-    wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-    images = [image for image in pick_frames(frames, wanted) if np.isfinite(image).all()]
+    """Return at most `count` frames without NaN, spread evenly over the stack, ``(K, H, W)``.
+
+    Of large frames, fewer.
+    """
+    frame_bytes = frames.shape[1] * frames.shape[2] * frames.dtype.itemsize
+    count = min(count, max(_FEWEST, _SURVEY_BYTES // frame_bytes))
+    images = [
+        np.array(image) for image in frames.pick(spread(len(frames), count)) if np.isfinite(image).all()
+    ]
     return np.array(images).reshape(-1, *frames.shape[1:])
 
 
-def pick_frames(frames: Frames, wanted: NDArray[np.integer[Any]]) -> list[NDArray[Any]]:
-    """Read the stack once and return the frames of ascending positions `wanted`."""
-    kept: list[NDArray[Any]] = []
-    done = 0
-    for block in frames.blocks():
-        inside = wanted[(wanted >= done) & (wanted < done + len(block))] - done
-        kept.extend(np.array(block[i]) for i in inside)
-        done += len(block)
-    return kept
+def spread(n: int, count: int) -> NDArray[np.int_]:
+    """Return at most `count` positions spread evenly over 0 … n − 1."""
+    return np.unique(np.linspace(0, n - 1, min(count, n)).round().astype(int))
 
 
 def pixel_noise(images: NDArray[Any]) -> float:
@@ -147,8 +190,8 @@ def pixel_noise(images: NDArray[Any]) -> float:
     corner = np.minimum(k1, k2) > 0.7
     window = np.hanning(images.shape[1])[:, None] * np.hanning(images.shape[2])
     powers = [
-        np.median(np.abs(np.fft.rfft2(image * window))[corner] ** 2) / np.log(2) / np.sum(window**2)
-        for image in images.astype(float)
+        np.median(np.abs(rfft2(image * window)[corner]) ** 2) / np.log(2) / np.sum(window**2)
+        for image in images
     ]
     return float(np.sqrt(np.median(powers)))
 
@@ -166,9 +209,8 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
     # a coarse look will do: pixels are averaged down to some 256 across
     b = max(1, int(min(images.shape[1:])) // _COARSE)
     if b > 1:
-        height, width = images.shape[1] // b * b, images.shape[2] // b * b
-        cells = images[:, :height, :width].reshape(-1, height // b, b, width // b, b).mean(axis=(2, 4))
-        return b * object_radius(np.asarray(cells), noise / b)
+        cells = Cells(images.shape[1:], b)
+        return b * object_radius(np.array([cells.average(image) for image in images]), noise / b)
     radius = farthest = float(np.hypot(*images.shape[1:]))
     for _ in range(3):
         profiles = [_radial_profile(image, noise, radius) for image in images]
@@ -200,48 +242,62 @@ def disc(shape: tuple[int, ...], center: Array, radius: float) -> tuple[Array, s
     reach = TAPER * radius
     rows = _inside(np.abs(x2 - center[1]) <= reach)
     columns = _inside(np.abs(x1 - center[0]) <= reach)
-    r2 = (x2[rows, None] - center[1]) ** 2 + (x1[columns] - center[0]) ** 2
-    ramp = np.clip((reach**2 - r2) / (reach**2 - radius**2), 0.0, 1.0)
-    weights: Array = ramp**2 * (3 - 2 * ramp)
+    width = reach**2 - radius**2
+    ramp = (reach**2 - (x2[rows, None] - center[1]) ** 2) / width - (x1[columns] - center[0]) ** 2 / width
+    np.clip(ramp, 0.0, 1.0, out=ramp)
+    weights = ramp * ramp
+    ramp *= -2
+    ramp += 3
+    weights *= ramp
     return weights, rows, columns
 
 
-def _find(
-    image: NDArray[Any], noise: float, radius: float, start: Array | None
-) -> tuple[Array, float, float] | None:
-    """Return centre [pixels], mass and level of one frame; None where nothing stands out of the noise."""
+@dataclass(frozen=True)
+class _Found:
+    """Centre [pixels], mass and level of one frame."""
+
+    center: Array
+    mass: float
+    level: float
+
+
+def _find(image: NDArray[Any], noise: float, radius: float, previous: _Found | None) -> _Found | None:
+    """Look for the object where it was in the previous frame; None where nothing stands out of the noise."""
     if not np.isfinite(image).all():
         return None
-    image = image.astype(float)
-    border = float(np.median(np.concatenate([image[:2].ravel(), image[-2:].ravel()])))
     outside = _outside_share(image.shape, radius) > _OUTSIDE
-    level = border if outside else 0.0
-    center = _brightest(image - border) if start is None else start
-    found = _centroid(image, level, noise, radius, center)
+    if previous is None:
+        border = float(np.median(np.concatenate([image[:2].ravel(), image[-2:].ravel()])))
+        level = border if outside else 0.0
+        center = _brightest(image - border)
+    else:
+        level, center = previous.level, previous.center
+    found = _centroid(image, level, noise, radius, center, _ROUGH * radius if outside else 0.0)
     if found is not None and outside:
         level = _level(image, noise, radius, found[0])
         found = _centroid(image, level, noise, radius, found[0])
     if found is None:
-        return None if start is None else _find(image, noise, radius, None)
-    return (*found, level)
+        return None if previous is None else _find(image, noise, radius, None)
+    return _Found(*found, level)
 
 
 def _centroid(
-    image: Array, level: float, noise: float, radius: float, center: Array
+    image: NDArray[Any], level: float, noise: float, radius: float, center: Array, enough: float = 0.0
 ) -> tuple[Array, float] | None:
     """Iterate the weighted centroid from a start; None where the mass does not stand out of the noise."""
     x1, x2 = _axes(image.shape)
     mass, lever = 0.0, _lever(image.shape, radius)
     for _ in range(_MOST_STEPS):
         weights, rows, columns = disc(image.shape, center, radius)
-        weighted = (image[rows, columns] - level) * weights
-        mass = float(weighted.sum())
+        weighted = np.subtract(image[rows, columns], level, dtype=float)
+        weighted *= weights
+        along, across = weighted.sum(axis=0), weighted.sum(axis=1)
+        mass = float(across.sum())
         if not mass > _SIGNIFICANT * noise * np.linalg.norm(weights):
             return None
         old = center
-        moments = weighted.sum(axis=0) @ x1[columns], weighted.sum(axis=1) @ x2[rows]
-        center = np.array(moments) / mass
-        if np.abs(center - old).max() < max(_CONVERGED, _FINE * noise * lever / mass):
+        center = np.array([along @ x1[columns], across @ x2[rows]]) / mass
+        if np.abs(center - old).max() < max(_CONVERGED, _FINE * noise * lever / mass, enough):
             break
     return center, mass
 
@@ -255,21 +311,25 @@ def _radial_profile(image: NDArray[Any], noise: float, radius: float) -> Array:
     if found is None:
         return np.zeros((2, rings))
     x1, x2 = _axes(image.shape)
-    ring = (np.hypot(x1 - found[0][0], (x2 - found[0][1])[:, None]) / _RING).astype(int).ravel()
-    power = ((image - border - found[2]) ** 2 - noise**2).ravel()
+    r2 = (x1 - found.center[0]) ** 2 + ((x2 - found.center[1]) ** 2)[:, None]
+    ring = (np.sqrt(r2) / _RING).astype(int).ravel()
+    power = ((image - border - found.level) ** 2 - noise**2).ravel()
     return np.stack([np.bincount(ring, minlength=rings)[:rings], np.bincount(ring, power, rings)[:rings]])
 
 
-def _level(image: Array, noise: float, radius: float, center: Array) -> float:
+def _level(image: NDArray[Any], noise: float, radius: float, center: Array) -> float:
     """Return the mean of the empty field, of what is like most of it: another particle does not count."""
     stride = max(1, min(image.shape) // _COARSE)
-    x1, x2 = _axes(image.shape)
-    r2 = (x2[::stride, None] - center[1]) ** 2 + (x1[::stride] - center[0]) ** 2
-    outside = image[::stride, ::stride][r2 > (TAPER * radius) ** 2]
-    if not len(outside):
+    x1, x2 = (x[::stride] for x in _axes(image.shape))
+    seen = image[::stride, ::stride].astype(float)
+    outside = (x2[:, None] - center[1]) ** 2 > (TAPER * radius) ** 2 - (x1 - center[0]) ** 2
+    some = seen[::_SPARSE, ::_SPARSE][outside[::_SPARSE, ::_SPARSE]]
+    if not len(some):
         return 0.0
-    typical = np.abs(outside - np.median(outside)) <= _SIGNIFICANT * noise
-    return float(outside[typical].mean())
+    typical = np.abs(seen - np.median(some)) <= _SIGNIFICANT * noise
+    typical &= outside
+    count = np.count_nonzero(typical)
+    return float(np.vdot(seen, typical.astype(float))) / count if count else float(np.median(some))
 
 
 @lru_cache(maxsize=64)
@@ -306,7 +366,7 @@ def _axes(shape: tuple[int, ...]) -> tuple[Array, Array]:
     return x1, x2
 
 
-def _brightest(image: Array) -> Array:
+def _brightest(image: NDArray[Any]) -> Array:
     """Return roughly where the object is: the middle of what is bright after strong smoothing."""
     size = max(3, min(image.shape) // 16)
     smooth = uniform_filter(image, size)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.errors import InputError
-from trapcli.motion.centers import TAPER, Centers, Progress, disc, pick_frames
+from trapcli.motion.centers import TAPER, Centers, Progress, disc
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.frames import Frames
 
@@ -194,7 +194,7 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     crop = min(reach, height), min(reach, width)
     wanted = np.flatnonzero(np.isfinite(centers.center[:, 0]))
     chosen = wanted[np.unique(np.linspace(0, len(wanted) - 1, _SURVEY).round().astype(int))]
-    images = np.array(pick_frames(attenuation, chosen))
+    images = np.array([np.array(image) for image in attenuation.pick(chosen)])
     finest = min(0.9 * np.pi / pixel_size, FINEST / centers.radius)
     whole = _Grid(
         crop, 1, radius, pixel_size, _rings(finest, centers.radius), _angles(int(FINEST * 1.6)), False
