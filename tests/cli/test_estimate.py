@@ -443,15 +443,19 @@ def test_nothing_is_done_where_one_output_exists(stack: Path, estimate: Call) ->
 def test_an_input_that_kills_its_process(stack: Path) -> None:
     os.link("sim.tif", "b.tif")
     program = (
-        "import os, signal, sys, trapcli.cli.estimate as e, trapcli.cli.workers as w\n"
+        "import os, signal, trapcli.cli.workers as w\n"
         "def work(job):\n"
         "    if job == 'bad': os.kill(os.getpid(), signal.SIGSEGV)\n"
         "    return job.upper()\n"
-        "if __name__ == '__main__': print(list(w.in_processes(work, ['a', 'bad', 'c', 'd'], 2)))\n"
+        "if __name__ == '__main__':\n"
+        "    with w.ProcessExecutor(2) as executor:\n"
+        "        futures = [executor.submit(work, job) for job in ('a', 'bad', 'c', 'd')]\n"
+        "        print([future.exception() or future.result() for future in futures])\n"
     )
     Path("program.py").write_text(program)
     done = subprocess.run([sys.executable, "program.py"], capture_output=True, text=True, check=False)
-    assert done.stdout == "['A', None, 'C', 'D']\n"
+    died = "LostWorkerError('the process that worked on it died')"
+    assert (done.stdout, done.stderr) == (f"['A', {died}, 'C', 'D']\n", "")
 
 
 # interruption and the terminal

@@ -4,19 +4,30 @@ from __future__ import annotations
 
 import os
 import re
-import traceback
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError, Executor, Future, as_completed
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from trapcli.cli.jobs import (
+    DONE,
+    FAILED,
+    NOT_TRUSTWORTHY,
+    STANDARD_INPUT,
+    Job,
+    Outcome,
+    is_up_to_date,
+    run_job,
+    run_job_in,
+)
 from trapcli.cli.options import (
     PATH,
     Console,
-    Progress,
     command_line,
     config_option,
     console_options,
@@ -27,40 +38,10 @@ from trapcli.cli.options import (
     refuse_input,
     resolve_config,
 )
-from trapcli.config import EstimateConfig, to_toml
-from trapcli.errors import ConfigError, InputError, OutputError, TrapError
-
-if TYPE_CHECKING:
-    from trapcli.result.motion import Motion
-    from trapcli.stack import Frames
-
-DONE, SOME_FAILED, NOT_TRUSTWORTHY = 0, 1, 4
-STANDARD_INPUT = "-"
-BACKGROUNDS = ("auto", "median", "surface", "border", "none")
-
-
-@dataclass(frozen=True)
-class Job:
-    """One input and what is to be made of it."""
-
-    source: str
-    output: Path
-    config: EstimateConfig
-    command_line: str
-    overwrite: bool = False
-    finished: bool = False
-    """The result is there already, from an earlier run."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a job: an exit code, a message where it isn't 0, a summary where there is a result."""
-
-    code: int
-    message: str = ""
-    summary: dict[str, Any] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
-    traceback: str = ""
+from trapcli.cli.progress import Overall
+from trapcli.cli.summary import check_summary, write_summary
+from trapcli.config import EstimateConfig
+from trapcli.errors import ConfigError, OutputError
 
 
 def _roi(_context: click.Context, _option: click.Parameter, value: str | None) -> tuple[int, ...] | None:
@@ -106,8 +87,14 @@ def _roi(_context: click.Context, _option: click.Parameter, value: str | None) -
     help="auto: one noise-weighted fit to all frames; paper: infinitesimal common lines.  [default: auto]",
 )
 @config_option
-@click.option("--jobs", type=click.IntRange(1, 1024), default=1, metavar="N", help="Inputs at a time.")
+@click.option("--jobs", type=click.IntRange(1, 1024), metavar="N", help="Inputs at a time.  [default: 1]")
+@click.option(
+    "--scheduler",
+    metavar="ADDRESS",
+    help="Let the workers of this Dask scheduler do it; they share the files.",
+)
 @click.option("--resume", is_flag=True, help="Keep results that are there and up to date.")
+@click.option("--summary", type=PATH, metavar="FILE", help="Table (CSV) of what became of each input.")
 @overwrite_option
 @json_option
 @console_options
@@ -115,8 +102,10 @@ def command(
     inputs: tuple[str, ...],
     output: Path | None,
     config: Path | None,
-    jobs: int,
+    jobs: int | None,
+    scheduler: str | None,
     resume: bool,
+    summary: Path | None,
     overwrite: bool,
     as_json: bool,
     console: Console,
@@ -134,23 +123,36 @@ def command(
     resolved = resolve_config(EstimateConfig, config, _tables(options))
     if output and len(inputs) > 1:
         raise ConfigError("-o: is for a single input; results of several lie beside them")
+    if scheduler is not None and (jobs is not None or STANDARD_INPUT in inputs):
+        raise ConfigError("--scheduler: goes neither with --jobs nor with standard input")
     planned = [
         Job(source, output or _output_for(source), resolved, command_line(), overwrite) for source in inputs
     ]
     planned = _checked(planned, resume)
-    codes = []
-    with closing(_outcomes(planned, jobs, console)) as outcomes:
-        for job, outcome in zip(planned, outcomes, strict=True):
-            _report(job, outcome, as_json, console)
-            codes.append(outcome.code)
+    if summary:
+        check_summary(summary, planned, overwrite=overwrite, resume=resume)
+    outcomes: list[Outcome] = []
+    overall = Overall(len(planned), console)
+    with closing(overall), closing(_outcomes(planned, jobs or 1, scheduler, console, overall)) as done:
+        for job, outcome in zip(planned, done, strict=True):
+            with overall.aside():
+                _report(job, outcome, as_json, console)
+            outcomes.append(outcome)
             if outcome.code == ConfigError.exit_code:  # no input can make sense of such options
                 return outcome.code
+    if summary:
+        write_summary(summary, planned, outcomes)
+    return _code(outcomes, console)
+
+
+def _code(outcomes: Sequence[Outcome], console: Console) -> int:
+    codes = [outcome.code for outcome in outcomes]
     if len(codes) == 1:
         return codes[0]
     failed = sum(code not in (DONE, NOT_TRUSTWORTHY) for code in codes)
     if failed:
         console.error(f"{failed} of {len(codes)} inputs failed")
-        return SOME_FAILED
+        return FAILED
     return max(codes)
 
 
@@ -203,7 +205,7 @@ def _checked(jobs: Sequence[Job], resume: bool) -> list[Job]:
         preprocess = job.config.preprocess
         refuse_input(job.output, Path(job.source), Path(preprocess.background), Path(preprocess.dark))
         if resume and job.output.is_file():
-            job = replace(job, finished=_is_up_to_date(job))
+            job = replace(job, finished=is_up_to_date(job))
             if not job.finished and not job.overwrite:
                 reason = "isn't what these options make of this input; pass --overwrite to replace it"
                 raise OutputError(f"{job.output}: {reason}")
@@ -218,110 +220,60 @@ def _checked(jobs: Sequence[Job], resume: bool) -> list[Job]:
     return checked
 
 
-def _is_up_to_date(job: Job) -> bool:
-    """Whether the result is complete, made with the same options, and newer than its input."""
-    from trapcli.result.motion import Motion
-
-    try:
-        motion = Motion.load(job.output)
-        source = Path(job.source)
-        older = source.exists() and source.stat().st_mtime > job.output.stat().st_mtime
-    except (InputError, OSError):
-        return False
-    return not older and motion.provenance.get("configuration") == to_toml(job.config)
-
-
-def _outcomes(jobs: Sequence[Job], count: int, console: Console) -> Generator[Outcome]:
+def _outcomes(
+    jobs: Sequence[Job], count: int, scheduler: str | None, console: Console, overall: Overall
+) -> Generator[Outcome]:
     """Do the jobs and yield what becomes of each, in order."""
-    if count == 1 or len(jobs) == 1:
+    if scheduler is not None:
+        from trapcli.cli.workers import cluster
+
+        with cluster(scheduler, console) as executor:
+            yield from _executed(jobs, executor, partial(run_job_in, os.getcwd()), overall)
+    elif count > 1 and len(jobs) > 1:
+        from trapcli.cli.workers import ProcessExecutor
+
+        with ProcessExecutor(min(count, len(jobs))) as executor:
+            yield from _executed(jobs, executor, run_job, overall)
+    elif len(jobs) > 1:
         for job in jobs:
-            with console.progress() as progress:
-                outcome = run_job(job, progress)
+            outcome = run_job(job, overall.stage)
+            overall.advance()
             yield outcome
-        return
-    from trapcli.cli.workers import in_processes
-
-    with closing(in_processes(run_job, jobs, min(count, len(jobs)))) as outcomes:
-        for job, done in zip(jobs, outcomes, strict=True):
-            yield done or Outcome(SOME_FAILED, f"{job.source}: the process that worked on it died")
+    else:
+        with console.progress() as progress:
+            outcome = run_job(jobs[0], progress)
+        yield outcome
 
 
-def run_job(job: Job, progress: Progress | None = None) -> Outcome:
-    """Estimate and save one motion; whatever goes wrong becomes part of the outcome."""
-    from trapcli.result.motion import Motion
-
+def _executed(
+    jobs: Sequence[Job], executor: Executor, work: Callable[[Job], Outcome], overall: Overall
+) -> Generator[Outcome]:
+    """Let an executor do what isn't finished; what it fails at is one job."""
+    futures = {n: executor.submit(work, job) for n, job in enumerate(jobs) if not job.finished}
     try:
-        if job.finished:
-            return _outcome(job, Motion.load(job.output))
-        return _estimate(job, progress)
-    except TrapError as error:
-        return Outcome(error.exit_code, str(error), traceback=traceback.format_exc())
-    except Exception as error:  # a fault of the program with one input must not stop the others
-        reason = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        message = f"{job.source}: unexpected fault ({reason}); please report it with what -vv shows"
-        return Outcome(SOME_FAILED, message, traceback=traceback.format_exc())
+        completed = as_completed(futures.values())
+        for n, job in enumerate(jobs):
+            if job.finished:
+                overall.advance()
+                yield run_job(job)
+                continue
+            while not futures[n].done():
+                next(completed)
+                overall.advance()
+            yield _result(job, futures[n])
+    finally:
+        for future in futures.values():
+            future.cancel()
 
 
-def _estimate(job: Job, progress: Progress | None) -> Outcome:
-    from trapcli.pipeline import estimate
-    from trapcli.stack import open_stack
-
-    frames = open_stack(job.source, job.config.input)
-    motion = estimate(frames, config=job.config, progress=progress)
-    motion = replace(motion, provenance=motion.provenance | _origin(job, frames))
-    motion.save(job.output, overwrite=job.overwrite)
-    return _outcome(job, motion)
-
-
-def _origin(job: Job, frames: Frames) -> dict[str, str]:
-    """Return the command line and the checksums of the files that were read."""
-    from trapcli.result import provenance
-    from trapcli.stack import open_stack
-
-    preprocess = job.config.preprocess
-    given = [] if preprocess.background in BACKGROUNDS else [preprocess.background]
-    if preprocess.dark_level is None:
-        given.append(preprocess.dark)
-    files = frames.info.files
-    for path in given * (not preprocess.attenuation):
-        files = (*files, *open_stack(path).info.files)
-    names = (STANDARD_INPUT if job.source == STANDARD_INPUT else "", *[""] * len(files))
-    lines = [provenance.checksum_line(file, name) for file, name in zip(files, names, strict=False)]
-    return {"command_line": job.command_line, "inputs": "\n".join(lines)}
-
-
-def _outcome(job: Job, motion: Motion) -> Outcome:
-    import numpy as np
-
-    valid = motion.valid > 0
-    # alpha isn't known where it is too small to be seen
-    speed = np.hypot(np.nan_to_num(motion.alpha), motion.omega_3)
-
-    def median(series: Any) -> float | None:
-        known = series[valid & np.isfinite(series)]
-        return float(np.median(known)) if len(known) else None
-
-    summary = {
-        "input": job.source,
-        "output": str(job.output),
-        "method": job.config.motion.method,
-        "frames": len(motion),
-        "valid": float(valid.mean()),
-        "identifiable": bool(motion.identifiable),
-        "verdict": motion.verdict,
-        "time_unit": motion.time_unit,
-        "length_unit": motion.length_unit,
-        "duration": float(motion.time[-1] - motion.time[0]),
-        "median_speed": median(speed),
-        "median_alpha": median(motion.alpha),
-        "median_omega_3": median(motion.omega_3),
-        "median_residual": median(motion.residual),
-    }
-    warnings = tuple(motion.provenance.get("warnings", "").splitlines())
-    if motion.identifiable and valid.any():
-        return Outcome(DONE, summary=summary, warnings=warnings)
-    message = f"{job.source}: not trustworthy: {motion.verdict.removeprefix('not trustworthy: ')}"
-    return Outcome(NOT_TRUSTWORTHY, message, summary, warnings)
+def _result(job: Job, future: Future[Outcome]) -> Outcome:
+    try:
+        return future.result()
+    except CancelledError:
+        reason = "was given up by the scheduler"
+    except Exception as error:  # of the executor: run_job raises none
+        reason = " ".join(str(error).split())[:300] or type(error).__name__
+    return Outcome(FAILED, f"{job.source}: {reason}; --resume tries it again")
 
 
 def _report(job: Job, outcome: Outcome, as_json: bool, console: Console) -> None:

@@ -1,48 +1,92 @@
-"""Work on many inputs at once, each in a process of its own.
+"""Work on many inputs at once, in processes of this machine or of a cluster, as one kind of executor.
 
-A pool that shares its processes among inputs would lose all of them to one that crashes a library.
+A pool that shares its processes among inputs would lose all of them to one that crashes a library. Here a
+process works on one input at a time, and another takes its place when it dies.
 """
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import threading
-from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
-from typing import TypeVar
+from typing import Any
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+from trapcli.cli.options import Console
+from trapcli.errors import ConfigError
+
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?[\w.\-\[\]:%]+:\d+")
+_PATIENCE = 10
+"""Seconds in which a scheduler must answer."""
 
 
-def in_processes(
-    work: Callable[[Item], Result], items: Sequence[Item], count: int
-) -> Generator[Result | None]:
-    """Yield ``work(item)`` for every item, in order, `count` at a time; None where the process died.
+class LostWorkerError(Exception):
+    """The process that worked on an input died."""
 
-    Closing the iterator, as Ctrl-C does, ends the processes; `work` meets that as a `KeyboardInterrupt`.
+
+class ProcessExecutor(Executor):
+    """Processes of this machine, each working on one item at a time.
+
+    Shutting it down, as Ctrl-C does, ends them; what they work on meets that as a `KeyboardInterrupt`.
 
     Parameters
     ----------
-    work:
-        A function of a module, which the processes import; it raises nothing else.
     count:
         Processes at a time.
     """
-    if os.name == "posix":
-        resource_tracker.ensure_running()  # starting it later would let interrupts through again
-    processes = _Processes(threads_each=max(1, (os.cpu_count() or 1) // count))
-    with ThreadPoolExecutor(count, initializer=_block_interrupts) as executor:
-        try:
-            yield from executor.map(processes.run, [work] * len(items), items)
-        finally:
-            processes.stop()
-            executor.shutdown(cancel_futures=True)
+
+    def __init__(self, count: int) -> None:
+        if os.name == "posix":
+            resource_tracker.ensure_running()  # starting it later would let interrupts through again
+        self._processes = _Processes(threads_each=max(1, (os.cpu_count() or 1) // count))
+        self._threads = ThreadPoolExecutor(count, initializer=_block_interrupts)
+
+    def submit(self, work: Callable[..., Any], /, *items: Any, **named: Any) -> Future[Any]:
+        """Call `work`, a function of a module, which the processes import; it should raise nothing."""
+        return self._threads.submit(self._processes.run, work, items, named)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = True) -> None:
+        """End the processes, whatever they work on."""
+        self._processes.stop()
+        self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
+
+
+@contextlib.contextmanager
+def cluster(address: str, console: Console) -> Iterator[Executor]:
+    """Give the workers of a Dask scheduler, which take over what one of them leaves undone.
+
+    Raises
+    ------
+    ConfigError
+        Where Dask isn't installed or no scheduler answers at `address`.
+    """
+    if not _ADDRESS.fullmatch(address):
+        raise ConfigError(f"--scheduler {address}: is no address; give one like tcp://host:8786")
+    try:
+        import dask
+
+        # what workers do is told by what becomes of the inputs; read when distributed is loaded
+        quiet = {"distributed": "critical", "distributed.client": "critical"}
+        with dask.config.set({"logging": quiet}):
+            from distributed import Client
+    except ImportError:
+        raise ConfigError("--scheduler: needs Dask; pip install 'trapcli[cluster]' brings it") from None
+    try:
+        client = Client(address, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ConfigError(f"--scheduler {address}: no scheduler answers there ({first})") from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            console.note(f"the scheduler {address} has no workers yet; waiting for them")
+        yield client.get_executor(pure=False)
 
 
 def _block_interrupts() -> None:
@@ -52,38 +96,41 @@ def _block_interrupts() -> None:
 
 
 class _Processes:
-    """The processes that run at the moment."""
+    """A process for every thread that asks for one."""
 
     def __init__(self, threads_each: int) -> None:
         self._threads_each = threads_each
-        self._running: set[SpawnProcess] = set()
+        self._running: dict[SpawnProcess, Connection] = {}
         self._stopped = False
         self._lock = threading.Lock()
+        self._mine = threading.local()
         # a fork would copy locks that threads of libraries hold
         self._context = multiprocessing.get_context("spawn")
 
-    def run(self, work: Callable[[Item], Result], item: Item) -> Result | None:
-        receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(
-            target=_serve, args=(work, item, sender, self._threads_each), daemon=True
-        )
+    def run(self, work: Callable[..., Any], items: tuple[Any, ...], named: dict[str, Any]) -> Any:
+        process, connection = getattr(self._mine, "process", None) or self._start()
+        try:
+            connection.send((work, items, named))
+            return connection.recv()
+        except (EOFError, OSError):
+            self._mine.process = None
+            with self._lock:
+                self._running.pop(process, None)
+            process.join()
+            connection.close()
+            raise LostWorkerError("the process that worked on it died") from None
+
+    def _start(self) -> tuple[SpawnProcess, Connection]:
         with self._lock:
             if self._stopped:
-                return None
+                raise LostWorkerError("the program was stopped")
+            here, there = self._context.Pipe()
+            process = self._context.Process(target=_serve, args=(there, self._threads_each), daemon=True)
             process.start()
-            self._running.add(process)
-        sender.close()
-        result: Result | None = None
-        try:
-            result = receiver.recv()
-        except EOFError:
-            pass
-        finally:
-            process.join()
-            receiver.close()
-            with self._lock:
-                self._running.discard(process)
-        return result
+            there.close()
+            self._running[process] = here
+        self._mine.process = process, here
+        return process, here
 
     def stop(self) -> None:
         with self._lock:
@@ -92,7 +139,7 @@ class _Processes:
                 process.terminate()
 
 
-def _serve(work: Callable[[Item], Result], item: Item, sender: Connection, threads: int) -> None:
+def _serve(connection: Connection, threads: int) -> None:
     def interrupt(_signal: int, _frame: object) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
         raise KeyboardInterrupt
@@ -101,6 +148,8 @@ def _serve(work: Callable[[Item], Result], item: Item, sender: Connection, threa
         signal.signal(signal.SIGTERM, interrupt)
         # read when the numerical libraries are loaded, by `work`
         os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-        sender.send(work(item))
-    except (KeyboardInterrupt, BrokenPipeError):
+        while True:
+            work, items, named = connection.recv()
+            connection.send(work(*items, **named))
+    except (KeyboardInterrupt, EOFError, BrokenPipeError):
         pass

@@ -7,7 +7,7 @@ import dataclasses
 import html
 import io
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from string import Template
@@ -83,13 +83,15 @@ def look_at(stack: str, motion: Motion, progress: Callable[[str, int, int], None
     checks = check_frames(attenuation, chosen, progress)
     size = pixel_size(frames, motion)
 
-    def shown(images: Sequence[NDArray[Any]]) -> tuple[Projection, ...]:
+    def shown(images: Iterable[NDArray[Any]]) -> tuple[Projection, ...]:
         numbers = motion.frame[chosen].tolist()
-        return tuple(Projection(n, image, size) for n, image in zip(numbers, images, strict=True))
+        return tuple(Projection(n, np.array(image), size) for n, image in zip(numbers, images, strict=False))
 
-    raw = () if config.preprocess.attenuation else shown(_images(frames, chosen))
+    raw = [] if config.preprocess.attenuation else frames.pick(np.array(chosen))
     info = attenuation.info
-    return Seen(raw, shown(checks.images), checks, _same_files(frames, motion), info.notes, info.warnings)
+    return Seen(
+        shown(raw), shown(checks.images), checks, _same_files(frames, motion), info.notes, info.warnings
+    )
 
 
 def page(motion: Motion, *, title: str, seen: Seen | None = None) -> str:
@@ -140,16 +142,6 @@ def path_on_sphere(motion: Motion) -> dict[str, Any]:
         "valid": [int(valid > 0) for valid in motion.valid[rows]],
         "unit": motion.time_unit,
     }
-
-
-def _images(frames: Frames, chosen: Sequence[int]) -> list[NDArray[Any]]:
-    images, start = {}, 0
-    for block in frames.blocks():
-        for position in chosen:
-            if start <= position < start + len(block):
-                images[position] = np.array(block[position - start])
-        start += len(block)
-    return [images[position] for position in chosen]
 
 
 def _same_files(frames: Frames, motion: Motion) -> bool:
