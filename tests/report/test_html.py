@@ -123,6 +123,12 @@ def test_path_is_the_viewing_direction_and_moves_at_alpha(make_motion):
     np.testing.assert_allclose(path["points"], exact, atol=1e-4)
     speed = np.linalg.norm(np.gradient(motion.R[:, :, 2], motion.time, axis=0), axis=1)
     np.testing.assert_allclose(speed[1:-1], motion.alpha[1:-1], rtol=3e-3)
+    tangent = np.gradient(motion.R[:, :, 2], motion.time, axis=0)
+    bend = np.cross(tangent, np.gradient(tangent, motion.time, axis=0))
+    curvature = np.sum(motion.R[:, :, 2] * bend, axis=1) / speed**3
+    sigma = np.gradient(motion.phi, motion.time)
+    exact_curvature = (motion.omega_3 + sigma) / motion.alpha
+    np.testing.assert_allclose(curvature[2:-2], exact_curvature[2:-2], atol=0.01)
     motion.R[3] = np.nan
     assert path_on_sphere(motion)["points"][3] is None
 
