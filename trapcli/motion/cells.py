@@ -51,7 +51,7 @@ class Cells:
         return means.reshape(height, width)
 
     def to_pixels(self, place: Array) -> Array:
-        """Turn ``(..., 2)`` (x1, x2) from the cell ``(H // b // 2, W // b // 2)`` into pixels from the origin."""
+        """Turn ``(..., 2)`` cells from the one in the middle of the averaged frame into pixels."""
         b = self.binning
         middle = [size // b // 2 * b + (b - 1) / 2 - size // 2 for size in reversed(self.shape)]
         return np.asarray(place * b + np.array(middle))

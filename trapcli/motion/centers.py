@@ -212,9 +212,14 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
         cells = Cells(images.shape[1:], b)
         return b * object_radius(np.array([cells.average(image) for image in images]), noise / b)
     radius = farthest = float(np.hypot(*images.shape[1:]))
+    found: list[_Found | None] = [None] * len(images)
     for _ in range(3):
-        profiles = [_radial_profile(image, noise, radius) for image in images]
-        pixels, power = np.sum(profiles, axis=0) if profiles else np.zeros((2, 1))
+        pixels, power = np.zeros((2, int(np.hypot(*images.shape[1:]) / _RING) + 1))
+        for n, image in enumerate(images):
+            # the border stands in for the empty field until the radius is known
+            image = image - np.median(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]))
+            found[n] = _find(image, noise, radius, found[n])
+            _add_profile(pixels, power, image, noise, found[n])
         pixels, power = pixels[pixels > 0], power[pixels > 0]
         if not len(pixels):
             return farthest
@@ -302,19 +307,17 @@ def _centroid(
     return center, mass
 
 
-def _radial_profile(image: NDArray[Any], noise: float, radius: float) -> Array:
-    """Return the pixels and their power beyond the noise in rings about the centre, ``(2, K)``."""
-    rings = int(np.hypot(*image.shape) / _RING) + 1
-    # the border stands in for the empty field until the radius is known
-    border = np.median(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]))
-    found = _find(image - border, noise, radius, None)
+def _add_profile(
+    pixels: Array, power: Array, image: NDArray[Any], noise: float, found: _Found | None
+) -> None:
+    """Add the pixels, and their power beyond the noise, in rings about the centre."""
     if found is None:
-        return np.zeros((2, rings))
+        return
     x1, x2 = _axes(image.shape)
     r2 = (x1 - found.center[0]) ** 2 + ((x2 - found.center[1]) ** 2)[:, None]
-    ring = (np.sqrt(r2) / _RING).astype(int).ravel()
-    power = ((image - border - found.level) ** 2 - noise**2).ravel()
-    return np.stack([np.bincount(ring, minlength=rings)[:rings], np.bincount(ring, power, rings)[:rings]])
+    ring = np.minimum(np.sqrt(r2) / _RING, len(pixels) - 1).astype(int).ravel()
+    pixels += np.bincount(ring, minlength=len(pixels))
+    power += np.bincount(ring, ((image - found.level) ** 2 - noise**2).ravel(), len(pixels))
 
 
 def _level(image: NDArray[Any], noise: float, radius: float, center: Array) -> float:

@@ -6,12 +6,15 @@ white again, with a known variance; the frames themselves are not needed any mor
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trapcli.motion.cells import cut_square, transfer
 from trapcli.motion.centers import Centers, Progress
 from trapcli.stack.frames import Frames
 
@@ -20,6 +23,8 @@ ComplexArray = NDArray[np.complex128]
 
 SQUARE = 1.15
 """Half the edge of the square, in radii of the object."""
+
+_POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
 
 @dataclass(frozen=True)
@@ -119,92 +124,130 @@ def read_low_band(
     progress:
         Called as ``progress("low band", done, N)``.
     """
-    half = int(np.ceil(SQUARE * centers.radius / pixel_size))
-    offset = np.arange(-half, half, dtype=np.float64) * pixel_size
-    edge = 2 * half * pixel_size
-    frequency = (
-        2 * np.pi / edge * np.arange(-int(band * edge / (2 * np.pi)), int(band * edge / (2 * np.pi)) + 1)
-    )
-    wave = np.exp(-1j * np.outer(frequency, offset))
-    k1, k2 = np.meshgrid(frequency, frequency)
-    kept = (np.hypot(k1, k2) <= band) & ((k2 > 0) | ((k2 == 0) & (k1 >= 0)))
-    k = np.stack([k1[kept], k2[kept]], axis=1)
-    order = np.argsort(np.hypot(k[:, 0], k[:, 1]), kind="stable")
-    measure = pixel_size**2 / (2 * np.pi)
-
-    n = len(attenuation)
-    modes = np.full((n, len(k)), np.nan, complex)
-    second, third, mass = np.full((n, 3), np.nan), np.full((n, 4), np.nan), np.full(n, np.nan)
+    reader = LowBandReader(len(attenuation), centers.radius, band, pixel_size)
     done = 0
     for block in attenuation.blocks():
         for image in block:
             center = centers.center[done] / pixel_size
             if np.isfinite(center).all():
                 whole = np.round(center).astype(int)
-                square = _cut(image, whole, half) - _cut_level(image.shape, centers.level[done], whole, half)
-                rest = (center - whole) * pixel_size
-                spectrum = (wave @ square @ wave.T)[kept]
-                modes[done] = measure * spectrum * np.exp(1j * k @ rest)
-                second[done], third[done], mass[done] = _moments(
-                    square, offset, rest, centers.radius, pixel_size
-                )
+                reader.read(done, cut_square(image, whole, reader.half, centers.level[done]))
             done += 1
         if progress is not None:
-            progress("low band", done, n)
-    typical = float(np.nanmedian(mass))
-    second_covariance, third_covariance = _moment_covariances(offset, centers.radius, pixel_size)
-    unit = (centers.noise / typical) ** 2
-    return LowBand(
-        time=time,
-        k=k[order],
-        modes=modes[:, order],
-        variance=(measure * centers.noise * 2 * half) ** 2,
-        second=second / typical,
-        third=third / typical,
-        second_covariance=second_covariance * unit,
-        third_covariance=third_covariance * unit,
-        mass=mass,
-        radius=centers.radius,
-    )
+            progress("low band", done, len(attenuation))
+    rest = centers.center - np.round(centers.center / pixel_size) * pixel_size
+    return reader.about(rest, time, centers.noise)
 
 
-def _cut(image: NDArray[np.generic], center: NDArray[np.int_], half: int) -> Array:
-    """Copy the square about `center` [pixels from the middle pixel]; outside the frame there is nothing."""
-    height, width = image.shape
-    top, left = center[1] + height // 2 - half, center[0] + width // 2 - half
-    square = np.zeros((2 * half, 2 * half))
-    rows = slice(max(top, 0), min(top + 2 * half, height))
-    columns = slice(max(left, 0), min(left + 2 * half, width))
-    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[
-        rows, columns
-    ]
-    return square
+class LowBandReader:
+    """Reads the low-frequency content of N frames off squares around the object.
+
+    Parameters
+    ----------
+    count:
+        N.
+    radius:
+        Of the object [length].
+    band:
+        Highest length of k [rad / length].
+    pixel_size:
+        Edge of a pixel [length].
+    binning:
+        Pixels along the edge of a cell of the squares.
+
+    Attributes
+    ----------
+    half:
+        A square has 2 `half` + 1 cells; the last row and column are left out.
+    """
+
+    def __init__(self, count: int, radius: float, band: float, pixel_size: float, binning: int = 1) -> None:
+        cell = binning * pixel_size
+        self.half = int(np.ceil(SQUARE * radius / cell))
+        self._cell, self._radius, self._binning = cell, radius, binning
+        offset = np.arange(-self.half, self.half, dtype=np.float64) * cell
+        edge = 2 * self.half * cell
+        highest = int(band * edge / (2 * np.pi))
+        frequency = 2 * np.pi / edge * np.arange(-highest, highest + 1)
+        k1, k2 = np.meshgrid(frequency, frequency)
+        kept = (np.hypot(k1, k2) <= band) & ((k2 > 0) | ((k2 == 0) & (k1 >= 0)))
+        order = np.argsort(np.hypot(k1, k2)[kept], kind="stable")
+        self._kept = np.flatnonzero(kept)[order]
+        self.k = np.stack([k1.ravel()[self._kept], k2.ravel()[self._kept]], axis=1)
+        # what averaging over a cell has taken from each mode, and the measure of the integral
+        taken = transfer(self.k, binning, pixel_size).prod(axis=1)
+        self._factor = cell**2 / (2 * np.pi) / taken
+        self._wave = np.exp(-1j * np.outer(frequency, offset))
+        weight, monomials = _monomials(offset, radius)
+        self._moment_weights = np.stack([(weight * m).ravel() for m in monomials])
+        self._modes = np.full((count, len(self.k)), np.nan, complex)
+        self._moments = np.full((count, len(monomials)), np.nan)
+
+    def read(self, n: int, square: Array) -> None:
+        """Read frame `n` off the square about a cell."""
+        inside = square[:-1, :-1]
+        self._modes[n] = ((self._wave @ inside) @ self._wave.T).ravel()[self._kept]
+        self._moments[n] = self._moment_weights @ inside.ravel()
+
+    def about(self, rest: Array, time: Array, noise: float) -> LowBand:
+        """Return what was read, about the centres.
+
+        Parameters
+        ----------
+        rest:
+            ``(N, 2)`` centres from the cells that the squares were about [length]; NaN in blank frames.
+        time:
+            ``(N,)``.
+        noise:
+            Standard deviation of the noise of one pixel.
+        """
+        modes = self._modes * (self._factor * np.exp(1j * rest @ self.k.T))
+        spread = (self._binning**2 - 1) / 12 * (self._cell / self._binning / self._radius) ** 2
+        moments = _central(_narrowed(self._moments, spread), rest / self._radius) * self._cell**2
+        mass = moments[:, 0]
+        seen = np.isfinite(mass)
+        typical = float(np.median(mass[seen])) if seen.any() else np.nan
+        cell_noise = noise / self._binning
+        weights = self._moment_weights * (self._cell**2 * cell_noise / typical)
+        covariance = weights @ weights.T
+        return LowBand(
+            time=time,
+            k=self.k,
+            modes=modes,
+            variance=float((self._factor[0] * cell_noise * 2 * self.half) ** 2),
+            second=moments[:, 3:6] / typical,
+            third=moments[:, 6:] / typical,
+            second_covariance=covariance[3:6, 3:6],
+            third_covariance=covariance[6:, 6:],
+            mass=mass,
+            radius=self._radius,
+        )
 
 
-def _cut_level(shape: tuple[int, ...], level: float, center: NDArray[np.int_], half: int) -> Array | float:
-    """Return the level of the empty field, 0 where the square lies outside the frame."""
-    return _cut(np.full(shape, level), center, half) if level else 0.0
+def _monomials(offset: Array, radius: float) -> tuple[Array, list[Array]]:
+    """Return the weight of the disc and the monomials of order 0 to 3, in radii."""
+    x1, x2 = np.meshgrid(offset / radius, offset / radius)
+    cell = (offset[1] - offset[0]) / radius
+    weight = np.clip((1.1 - np.hypot(x1, x2)) / (2 * cell) + 0.5, 0.0, 1.0)
+    return weight, [x1**a * x2**b for a, b in _POWERS]
 
 
-def _monomials(offset: Array, rest: Array, radius: float) -> tuple[Array, list[Array]]:
-    """Return the weight of the disc and the monomials of order 2 and 3 about the centre, in radii."""
-    x1, x2 = np.meshgrid((offset - rest[0]) / radius, (offset - rest[1]) / radius)
-    pixel = (offset[1] - offset[0]) / radius
-    weight = np.clip((1.1 - np.hypot(x1, x2)) / (2 * pixel) + 0.5, 0.0, 1.0)
-    return weight, [x1**2, x1 * x2, x2**2, x1**3, x1**2 * x2, x1 * x2**2, x2**3]
+def _narrowed(moments: Array, spread: float) -> Array:
+    """Return moments without what averaging over cells of variance `spread` has added (Sheppard)."""
+    m00, m10, m01, m20, m11, m02, m30, m21, m12, m03 = moments.T
+    s = spread
+    narrow = (m20 - s * m00, m11, m02 - s * m00)
+    third = (m30 - 3 * s * m10, m21 - s * m01, m12 - s * m10, m03 - 3 * s * m01)
+    return np.stack([m00, m10, m01, *narrow, *third], axis=1)
 
 
-def _moments(
-    square: Array, offset: Array, rest: Array, radius: float, pixel_size: float
-) -> tuple[Array, Array, float]:
-    weight, monomials = _monomials(offset, rest, radius)
-    weighted = (square * weight).ravel() * pixel_size**2
-    values = np.array([m.ravel() @ weighted for m in monomials])
-    return values[:3], values[3:], float(weighted.sum())
-
-
-def _moment_covariances(offset: Array, radius: float, pixel_size: float) -> tuple[Array, Array]:
-    weight, monomials = _monomials(offset, np.zeros(2), radius)
-    columns = np.stack([(m * weight).ravel() for m in monomials], axis=1) * pixel_size**2
-    covariance = columns.T @ columns
-    return covariance[:3, :3], covariance[3:, 3:]
+def _central(moments: Array, shift: Array) -> Array:
+    """Return ``(N, 10)`` moments about points that lie at ``(N, 2)`` `shift`."""
+    about = np.zeros_like(moments)
+    place = {power: n for n, power in enumerate(_POWERS)}
+    x, y = -shift.T
+    for (a, b), n in place.items():
+        for i, j in itertools.product(range(a + 1), range(b + 1)):
+            share = math.comb(a, i) * math.comb(b, j) * x ** (a - i) * y ** (b - j)
+            about[:, n] += share * moments[:, place[i, j]]
+    return about

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.errors import InputError
-from trapcli.motion.centers import TAPER, Centers, Progress, disc
+from trapcli.motion.cells import transfer
+from trapcli.motion.centers import TAPER, Centers, Progress, disc, spread
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.frames import Frames
 
@@ -37,6 +38,8 @@ _SINGLE_PRECISION = (
 )
 _ALIAS = 0.3  # amplitude of an alias in units of the noise
 _BATCH = 32  # frames per transform
+_MOST_LINES = 96  # that the low band may need
+_NEGLIGIBLE = 1e-10  # share of the band's waves that may be lost
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,9 @@ class _PolarTransform:
         self._k1 = np.multiply.outer(grid.mu, np.cos(grid.phi))
         self._k2 = np.multiply.outer(grid.mu, np.sin(grid.phi))
         # what averaging over a cell has taken from each frequency, and the measure of the integral
-        self._factor = cell**2 / (2 * np.pi) / (_cell_mean(self._k1, grid) * _cell_mean(self._k2, grid))
+        taken = transfer(self._k1, grid.binning, grid.pixel_size)
+        taken *= transfer(self._k2, grid.binning, grid.pixel_size)
+        self._factor = cell**2 / (2 * np.pi) / taken
         self._points = [
             (k * cell).ravel().astype(np.float32 if grid.single else np.float64) for k in (self._k2, self._k1)
         ]
@@ -163,11 +168,89 @@ class _PolarTransform:
         return self._plans[batch]
 
 
-def _cell_mean(k: Array, grid: _Grid) -> Array:
-    """Return the mean over one binned cell of exp(−ikx) about the cell's middle."""
-    b = grid.binning
-    offsets = (np.arange(b) - (b - 1) / 2) * grid.pixel_size
-    return np.asarray(np.mean(np.cos(np.multiply.outer(k, offsets)), axis=-1))
+class BandReader:
+    """Reads the low band of N frames off squares around the object, for a polar grid of any kind.
+
+    A square of cells, weighted with the object's disc, is projected onto functions that span all waves of the
+    band on either axis. The few numbers that are left of a frame hold all its samples.
+
+    Parameters
+    ----------
+    count:
+        N.
+    radius:
+        Of the object [length].
+    band:
+        Highest spatial frequency [rad / length].
+    pixel_size:
+        Edge of a pixel [length].
+    binning:
+        Pixels along the edge of a cell of the squares.
+
+    Attributes
+    ----------
+    half:
+        A square has 2 `half` + 1 cells.
+    """
+
+    def __init__(self, count: int, radius: float, band: float, pixel_size: float, binning: int = 1) -> None:
+        cell = binning * pixel_size
+        self.half = int(np.ceil(TAPER * radius / cell))
+        self._pixel_size, self._binning, self._radius = pixel_size, binning, radius
+        self._offset = np.arange(-self.half, self.half + 1, dtype=np.float64) * cell
+        self._weights = np.zeros((2 * self.half + 1,) * 2)
+        weights, rows, columns = disc(self._weights.shape, np.zeros(2), radius / cell)
+        self._weights[rows, columns] = weights
+        self._mu = _rings(min(band, 0.9 * np.pi / cell), radius)
+        self._basis = _spanning(self._offset, float(self._mu[-1]))
+        self._projections = np.full((count, self._basis.shape[1] ** 2), np.nan)
+
+    def read(self, n: int, square: Array) -> None:
+        """Read frame `n` off the square about a cell."""
+        self._projections[n] = (self._basis.T @ ((square * self._weights) @ self._basis)).ravel()
+
+    def about(self, rest: Array, time: Array, noise: float) -> ReducedMap:
+        """Return the reduced map about the centres (``eqRecMapReduced``).
+
+        Parameters
+        ----------
+        rest:
+            ``(N, 2)`` centres from the cells that the squares were about [length]; NaN in blank frames.
+        time:
+            ``(N,)``.
+        noise:
+            Standard deviation of the noise of one pixel.
+        """
+        area = (self._binning * self._pixel_size) ** 2 / (2 * np.pi)
+        noise = area * float(np.linalg.norm(self._weights)) * noise / self._binning
+        seen = np.flatnonzero(np.isfinite(rest[:, 0]))
+        lines = 16
+        if len(seen):
+            some = seen[spread(len(seen), _SURVEY)]
+            survey = self._samples(some, rest[some], _angles(_MOST_LINES))
+            lines = _lines(survey, max(0.01 * noise, 1e-15 * float(np.abs(survey).max())))
+        phi = _angles(lines)
+        samples = np.full((len(time), len(self._mu), lines), np.nan, complex)
+        samples[seen] = self._samples(seen, rest[seen], phi)
+        return ReducedMap(samples, self._mu, phi, time, noise, self._radius)
+
+    def _samples(self, frames: NDArray[np.int_], rest: Array, phi: Array) -> NDArray[np.complex128]:
+        k1, k2 = (np.multiply.outer(self._mu, axis) for axis in (np.cos(phi), np.sin(phi)))
+        waves = [np.exp(-1j * np.outer(k, self._offset)) @ self._basis for k in (k1, k2)]
+        both = (waves[1][:, :, None] * waves[0][:, None]).reshape(k1.size, -1)
+        taken = transfer(k1, self._binning, self._pixel_size) * transfer(k2, self._binning, self._pixel_size)
+        factor = (self._binning * self._pixel_size) ** 2 / (2 * np.pi) / taken
+        values = self._projections[frames]
+        polar = (values @ both.real.T + 1j * (values @ both.imag.T)).reshape(-1, *k1.shape)
+        polar *= factor * np.exp(1j * (rest[:, 0, None, None] * k1 + rest[:, 1, None, None] * k2))
+        return np.asarray(polar)
+
+
+def _spanning(x: Array, highest: float) -> Array:
+    """Return orthonormal functions on `x` that span exp(−ikx) for all |k| ≤ `highest`, ``(X, m)``."""
+    turns = np.multiply.outer(x, np.linspace(0, highest, 2 * int(highest * np.abs(x).max()) + 8))
+    functions, size, _ = np.linalg.svd(np.concatenate([np.cos(turns), np.sin(turns)], axis=1))
+    return np.asarray(functions[:, : np.count_nonzero(size > _NEGLIGIBLE * size[0])])
 
 
 def _cut(image: NDArray[Any], center: Array, level: float, grid: _Grid, target: Array) -> Array:
@@ -193,7 +276,7 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     reach = 2 * int(np.ceil(TAPER * radius) + 1)
     crop = min(reach, height), min(reach, width)
     wanted = np.flatnonzero(np.isfinite(centers.center[:, 0]))
-    chosen = wanted[np.unique(np.linspace(0, len(wanted) - 1, _SURVEY).round().astype(int))]
+    chosen = wanted[spread(len(wanted), _SURVEY)]
     images = np.array([np.array(image) for image in attenuation.pick(chosen)])
     finest = min(0.9 * np.pi / pixel_size, FINEST / centers.radius)
     whole = _Grid(
