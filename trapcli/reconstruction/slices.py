@@ -19,7 +19,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex64]
 
-MARGIN = 1.15
+MARGIN = 1.3
 """Half the edge of the square, and of the volume, in radii of the object."""
 
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which errors of the model dominate

@@ -39,6 +39,7 @@ _FEWEST_STEPS = 5
 _SMALL_CHANGE = 5e-4  # of a volume in one step, that ends them
 _POWER_STEPS = 8
 _SAFE = 1.1
+_INDEPENDENT = 0.2  # share of the gradients that count: neighbours are alike, and most of the ball is empty
 _CORNER = 0.1  # gradient, in units of the mean, below which the total variation is rounded
 
 
@@ -241,11 +242,11 @@ class _Variation:
 
     @classmethod
     def of(cls, volume: Lattice, support: NDArray[np.bool_]) -> _Variation:
-        """Return the most likely weight for gradients as large as those of a volume."""
+        """Return the weight that gradients as large as those of a volume ask for."""
         lengths = np.sqrt(np.sum(_gradient(volume) ** 2, axis=0))[support]
         mean = float(lengths.mean()) or 1.0
         # p(g) ∝ exp(−weight |g|) in three dimensions has the mean 3 / weight
-        return cls(3 / mean, _CORNER * mean)
+        return cls(3 * _INDEPENDENT / mean, _CORNER * mean)
 
     @property
     def curvature(self) -> float:

@@ -24,7 +24,7 @@ MOST_VOXELS = 160
 """Most voxels along an edge where the user does not choose: they need 1 GB of memory."""
 
 _VOXELS = (8, 512)
-_SUPPORT = 1.1  # radius of the ball that the object lies in, in radii of the object
+_SUPPORT = 1.25  # radius of the ball that the object lies in, in radii of the object: faint tails need room
 _UNEXPLAINED = 1.5  # misfit, in units of the noise, that the motion should not leave
 
 
