@@ -15,6 +15,8 @@ from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from trapcli.preprocess.specks import Standing, find_specks
+
 Array = NDArray[np.float64]
 Stack = NDArray[np.float32]
 Bools = NDArray[np.bool_]
@@ -22,27 +24,20 @@ Bools = NDArray[np.bool_]
 _BORDER = 0.04  # width of the border, as a share of the shorter edge
 _DEGREES = (2, 4, 6)  # of the surface; the one that best foretells the field beside the particle is taken
 _PATCH = 5  # edge of the mean in which the particle must stand out [pixels]
+_LOOK = 2  # first round in which specks under the particle are looked for
 _DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, as a share of its peak
 _CLEAR = 0.8  # the same in standard deviations of a pixel: 4 of the mean over a patch
+_ALWAYS = 0.9  # share of the frames in which dust is seen
+_SMALL = 0.1  # its area as a share of the particle's
 _MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
 _DIRECT = (
     0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
 )
 _SIGNIFICANT = 4.0  # standard deviations
-_SPECK = 3.0  # size of a speck [pixels]: what is smoother belongs to the particle or to the surface
-_STEADY = 3.0  # depth of a speck in units of its scatter in time: the particle's own features move
-_ROUND = 0.3  # least ratio of its curvatures
-_REACH = 5  # farthest that a speck extends from such a place [pixels]
-_FLANK = 0.3  # depth of its flank, as a share of its own
-_RIM = 3  # width by which a speck is larger than what stands out of it [pixels]
-_MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
-_PARTS = 8  # of the stack, in which a speck must be found
-_AROUND = 5  # width of a speck's surroundings [pixels]
-_SMOOTH = 3  # degree of the particle around a speck
-_FAINTEST = 0.005  # depth of a speck
 _QUIET = 0.95  # share of frames in which a pixel that tells the brightness lies outside of the particle
 _LEAST_QUIET = 0.02  # share of such pixels below which the border has to do
 _TILTED = 0.003  # least tilt of the light, from the middle to the edge of a frame, that is taken out
+_TYPICAL_PIXELS = 4096  # that tell what misfit is common among those
 _MOST_PIXELS = 65536  # of a surface, and of a frame's brightness: enough for both
 
 
@@ -80,21 +75,24 @@ class Light:
         values = log_ratio.ravel()[self.pixels].astype(float)
         keep = np.isfinite(values)
         coefficients = np.full(self.basis.shape[1], np.nan)
-        if keep.sum() < 3 * self.basis.shape[1]:
+        if np.count_nonzero(keep) < 3 * self.basis.shape[1]:
             return coefficients
-        values, basis = values[keep], self.basis[keep]
-        misfit = values - np.median(values)
+        values, basis = (values, self.basis) if keep.all() else (values[keep], self.basis[keep])
+        some = slice(None, None, max(1, len(values) // _TYPICAL_PIXELS))
+        misfit = values - np.median(values[some])
         for _ in range(2):
-            near = np.abs(misfit) <= 3 * 1.4826 * np.median(np.abs(misfit)) + 1e-12
+            near = np.abs(misfit) <= 3 * 1.4826 * np.median(np.abs(misfit[some])) + 1e-12
             if self.basis.shape[1] == 1:
                 coefficients = np.array([values[near].mean()])
             else:
                 coefficients = np.linalg.lstsq(basis[near], values[near], rcond=None)[0]
-            misfit = values - basis @ coefficients
+            misfit = values - (coefficients if len(coefficients) == 1 else basis @ coefficients)
         return coefficients
 
     def of(self, coefficients: Array, shape: tuple[int, ...]) -> Array:
-        """Return the light in all pixels."""
+        """Return the light in all pixels, or what is added to all alike."""
+        if len(coefficients) == 1:
+            return coefficients
         return np.asarray((coefficients @ self.surface).reshape(shape))
 
     def even(self, log_ratio: Stack) -> Stack:
@@ -117,7 +115,7 @@ class EmptyField:
     outside:
         ``(H, W)`` share of the frames in which a pixel lies outside of the particle.
     degree, specks:
-        Of the surface; number of specks found.
+        Of the surface; number of specks found under the particle.
     """
 
     log_light: Array
@@ -161,7 +159,7 @@ def fit_empty_field(logs: Stack) -> EmptyField:
     noise = _noise(logs, edge)
     degree, pattern, specks = 2, np.zeros(field.shape), 0
     outside = np.ones(logs.shape, bool)
-    for depth in _DEPTHS:
+    for step, depth in enumerate(_DEPTHS):
         residual = light.even(logs - (field + pattern).astype(np.float32))
         outside = _outside(residual, noise, depth)
         quiet = outside.mean(axis=0) >= _QUIET
@@ -171,7 +169,13 @@ def fit_empty_field(logs: Stack) -> EmptyField:
         mean += field + pattern
         degree = _degree(mean, count)
         field = _surface(mean, count, degree)
-        pattern, specks = _pattern(light.even(logs - field.astype(np.float32)), mean - field, count, noise)
+        pattern, specks = _pattern(
+            light.even(logs - field.astype(np.float32)),
+            mean - field,
+            count,
+            noise,
+            look=step >= _LOOK,
+        )
     return EmptyField(field + pattern, light, outside.mean(axis=0), degree, specks)
 
 
@@ -208,9 +212,19 @@ def _outside(residual: Stack, noise: float, depth: float) -> Bools:
     smooth = np.array([ndimage.uniform_filter(np.nan_to_num(image), _PATCH) for image in residual])
     peak = float(np.median(np.quantile(np.abs(smooth), 0.999, axis=(1, 2))))
     inside = np.abs(smooth) > max(_CLEAR * noise, depth * peak)
+    inside &= ~_stuck(inside)
     reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
     grown = [ndimage.maximum_filter(image, reach) for image in inside]
     return ~np.array(grown) & np.isfinite(residual)
+
+
+def _stuck(inside: Bools) -> Bools:
+    """Tell what is in all frames and small beside the particle: dust, which would hide what it covers."""
+    labels, _ = ndimage.label(inside.mean(axis=0) > _ALWAYS)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    small = (sizes > 0) & (sizes < _SMALL * np.median(inside.sum(axis=(1, 2))))
+    return np.asarray(small[labels])
 
 
 def _mean_outside(residual: Stack, outside: Bools) -> tuple[Array, Array]:
@@ -257,7 +271,7 @@ def _degree(mean: Array, count: Array) -> int:
     return _DEGREES[int(np.argmin(errors))]
 
 
-def _pattern(residual: Stack, direct: Array, count: Array, noise: float) -> tuple[Array, int]:
+def _pattern(residual: Stack, direct: Array, count: Array, noise: float, look: bool) -> tuple[Array, int]:
     """Return what the surface lacks: what is measured outside of the particle, and specks under it."""
     measured = count >= _DIRECT * len(residual)
     scatter = noise / np.sqrt(np.maximum(count, 1))
@@ -268,84 +282,10 @@ def _pattern(residual: Stack, direct: Array, count: Array, noise: float) -> tupl
     )
     trust = np.where(clear, 1.0, spread / np.maximum(spread + scatter**2, 1e-300))
     pattern = np.where(measured, trust * direct, 0.0)
-    regions = _speck_regions(residual)
-    number = 0
-    whole = float(np.abs(np.nan_to_num(residual)).sum(dtype=float)) / len(residual)
-    for label, place in enumerate(ndimage.find_objects(regions), start=1):
-        window, depth = _speck_depth(residual, regions, label, place)
-        spot = regions[window] == label
-        # what makes up most of all there is to see is the particle
-        if depth is not None and np.abs(depth[spot]).sum() < _MOST * whole:
-            here = spot & ~measured[window]
-            pattern[window][here] = depth[here]
-            number += 1
-    return pattern, number
-
-
-def _speck_regions(residual: Stack) -> NDArray[np.int32]:
-    """Label the regions of sharp spots that are in the same place in (almost) all parts of the stack."""
-    sharp = np.empty(residual.shape, np.float16)  # holds what is sharp to 1e-3 of it
-    for k, image in enumerate(residual):
-        sharp[k] = _sharp(np.nan_to_num(image))
-    middle = _middle(sharp)
-    scatter = _scatter(sharp, middle)
-    parts = [_middle(part) for part in np.array_split(sharp, min(_PARTS, len(sharp)))]
-    depths = np.sort(np.array(parts) * np.sign(middle), axis=0)
-    # in one part the particle's edge may hide the speck
-    least = depths[min(1, len(depths) - 1)]
-    found = least > np.maximum(_STEADY * scatter, _FAINTEST)
-    seeds = found & _is_compact(middle)
-    found &= least > _FLANK * ndimage.maximum_filter(np.where(seeds, least, 0), 2 * _REACH + 1)
-    grown = ndimage.binary_dilation(seeds, iterations=_REACH, mask=found)
-    labels, _ = ndimage.label(ndimage.binary_dilation(grown, iterations=_RIM))
-    return np.asarray(labels, dtype=np.int32)
-
-
-def _is_compact(image: Array) -> Bools:
-    """Tell where an image curves alike in all directions, as a speck does and the particle's edge doesn't."""
-    along, across, mixed = (ndimage.gaussian_filter(image, 1.0, order) for order in ((2, 0), (0, 2), (1, 1)))
-    mean, deviation = (along + across) / 2, np.hypot((along - across) / 2, mixed)
-    return np.asarray(np.abs(mean) - deviation > _ROUND * (np.abs(mean) + deviation))
-
-
-def _scatter(stack: NDArray[np.float16], middle: Array) -> Array:
-    """Return the scatter in time about the median."""
-    scatter = np.empty(middle.shape)
-    for row, center in enumerate(middle):
-        scatter[row] = 1.4826 * np.median(np.abs(stack[:, row].astype(np.float32) - center), axis=0)
-    return scatter
-
-
-def _sharp(image: Stack) -> Stack:
-    return np.asarray(ndimage.gaussian_filter(image, 0.7) - ndimage.gaussian_filter(image, _SPECK))
-
-
-def _speck_depth(
-    residual: Stack, regions: NDArray[np.int32], label: int, place: tuple[slice, ...]
-) -> tuple[tuple[slice, slice], Array | None]:
-    """Return what stands out of the surroundings of a spot in most frames; None where that does not last."""
-    rows, columns = (
-        slice(max(0, s.start - _AROUND), min(size, s.stop + _AROUND))
-        for s, size in zip(place, regions.shape, strict=True)
-    )
-    window, spot = regions[rows, columns], regions[rows, columns] == label
-    ring = ndimage.binary_dilation(spot, iterations=_AROUND) & (window == 0)
-    values = np.nan_to_num(residual[:, rows, columns]).astype(float)
-    x2, x1 = np.meshgrid(*map(_unit, window.shape), indexing="ij")
-    terms = range(_SMOOTH + 1)
-    basis = np.stack([x1**i * x2**j for i in terms for j in terms if i + j <= _SMOOTH], axis=-1)
-    if ring.sum() < 2 * basis.shape[-1]:
-        return (rows, columns), None
-    surfaces = values[:, ring] @ np.linalg.pinv(basis[ring]).T @ basis.reshape(-1, basis.shape[-1]).T
-    depths = values - surfaces.reshape(values.shape)
-    rough = np.mean(depths[:, ring] ** 2, axis=1)
-    # the frames in which no edge of the particle passes by tell the depth
-    depths = depths[rough <= np.median(rough)]
-    depth = np.median(depths, axis=0)
-    share = depths[:, spot] @ depth[spot] / np.sum(depth[spot] ** 2)
-    if np.quantile(share, 0.1) < 0.5 or np.quantile(share, 0.9) > 1.5:
-        return (rows, columns), None
-    return (rows, columns), np.asarray(depth)
+    if not look:
+        return pattern, 0
+    specks, number = find_specks(Standing.of(residual, noise), measured)
+    return np.where(measured, pattern, specks), number
 
 
 def _is_tilted(residual: Stack, quiet: Bools, noise: float) -> bool:

@@ -1,0 +1,295 @@
+"""Specks that stay in place under a particle that never leaves it.
+
+The mean in time of log I under the particle is log I₀ minus the particle's mean projection, which motion
+makes smooth but not flat. Its covariance is told by how the projections vary in time: whatever stays in place
+drops out of that. A speck is a round spot of lower transmission, 1 − d exp(−r² / 2 s²): the one that best
+explains the mean, given this covariance, is fitted, then the next. What drifts with the particle is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg, ndimage, optimize
+
+Array = NDArray[np.float64]
+Stack = NDArray[np.float32]
+Bools = NDArray[np.bool_]
+
+_CLEARLY_DARK = 0.1  # share of a frame's peak that belongs to the particle
+_PARTS = 8  # of the stack, in which a speck must be found
+_INDEPENDENT = 20  # projections that differ enough for their mean to have less variance by this factor
+_SHARP = (0.7, 3.0)  # widths of the two means between which a speck shows [pixels]
+_ROUND = 0.3  # least ratio of a speck's curvatures
+_SEEN = 4.0  # standard errors by which a candidate stands out
+_SURE = 6.0  # standard errors of the depth of a speck
+_FAINTEST = 0.005  # depth of a speck
+_STEADY = 30.0  # the same for its depth in parts of the stack
+_VERY_STEADY = 100.0  # where the particle drifts too little to tell what drifts with it
+_SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
+_LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
+_DEEPEST = 0.98
+_NEAR = 14  # half the edge of the window in which a speck is fitted [pixels]
+_TOGETHER = 10  # distance at which two specks are fitted together [pixels]
+_OTHERS = 6.0  # radius in which pixels belong to another candidate [pixels]
+_MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
+_ROUNDS = 3  # of looking for more
+_MOST_AT_ONCE = 60  # candidates of a round
+_MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What stays in place in frames without their smooth background.
+
+    Attributes
+    ----------
+    image:
+        ``(H, W)`` mean in time.
+    error:
+        Standard deviation of its noise.
+    parts:
+        ``(P, H, W)`` means over consecutive parts of the stack.
+    frames:
+        ``(K, H, W)`` log(I / I₀), all of them.
+    drift:
+        ``(K, 2)`` by how much the particle is away from its mean place (rows, columns) [pixels].
+    """
+
+    image: Array
+    error: float
+    parts: Array
+    frames: Stack
+    drift: Array
+
+    @classmethod
+    def of(cls, frames: Stack, noise: float) -> Self:
+        """Summarise ``(K, H, W)`` log(I / I₀) with pixel noise of a standard deviation `noise`."""
+        parts = [_mean(part) for part in np.array_split(frames, min(_PARTS, len(frames)))]
+        return cls(_mean(frames), noise / np.sqrt(len(frames)), np.array(parts), frames, _drift(frames))
+
+
+def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
+    """Return the specks that are not wholly in `free`, as they are in log I₀, and their number.
+
+    Parameters
+    ----------
+    free:
+        ``(H, W)`` where no specks are needed: the image itself is the background.
+    """
+    shape = standing.image.shape
+    reach = ndimage.binary_dilation(~free, iterations=_NEAR // 2)
+    whole = float(np.abs(standing.image).sum())
+    specks: list[Array] = []
+    refused = np.zeros(shape, bool)
+    for _ in range(_ROUNDS):
+        found = False
+        places = _candidates(standing, render(specks, shape), reach & ~refused)
+        for place in places:
+            if any(np.hypot(*(speck[:2] - place)) < 1.0 for speck in specks):
+                continue
+            near = [k for k, speck in enumerate(specks) if np.hypot(*(speck[:2] - place)) < _TOGETHER]
+            fitted = _fit(standing, place, specks, near, places)
+            if fitted is None or np.abs(render([fitted[0]], shape)).sum() > _MOST * whole:
+                rows, columns = _window(place, shape, 2)
+                refused[rows, columns] = True
+                continue
+            for k, speck in zip(near, fitted[1:], strict=True):
+                specks[k] = speck
+            specks.append(fitted[0])
+            found = True
+        if not found:
+            break
+    return render(specks, shape), len(specks)
+
+
+def _drift(frames: Stack) -> Array:
+    """Return how the centroid of what attenuates moves."""
+    places = []
+    for image in frames:
+        dark = np.clip(-np.nan_to_num(image), 0, None)
+        dark[dark < _CLEARLY_DARK * dark.max()] = 0
+        places.append(ndimage.center_of_mass(dark) if dark.any() else (np.nan, np.nan))
+    drift = np.array(places) - np.nanmedian(places, axis=0)
+    return np.asarray(np.nan_to_num(drift))
+
+
+def render(specks: list[Array], shape: tuple[int, ...]) -> Array:
+    """Return log of the transmission of specks (row, column, size, depth)."""
+    image = np.zeros(shape)
+    for row, column, size, depth in specks:
+        rows, columns = _window(np.array([row, column]), shape, int(np.ceil(6 * size)))
+        x2, x1 = np.ogrid[rows, columns]
+        image[rows, columns] += _profile(x2, x1, row, column, size, depth)
+    return image
+
+
+def _mean(stack: Stack) -> Array:
+    """Return the mean in time of what is known; 0 where nothing is."""
+    known = np.isfinite(stack)
+    total = np.where(known, stack, 0).sum(axis=0, dtype=float)
+    return np.asarray(total / np.maximum(known.sum(axis=0), 1))
+
+
+def _profile(
+    x2: NDArray[np.generic], x1: NDArray[np.generic], row: float, column: float, size: float, depth: float
+) -> Array:
+    r2 = (x2 - row) ** 2 + (x1 - column) ** 2  # type: ignore[operator]
+    return np.asarray(np.log1p(-depth * np.exp(-r2 / (2 * size**2))))
+
+
+def _slopes(
+    x2: NDArray[np.generic], x1: NDArray[np.generic], row: float, column: float, size: float, depth: float
+) -> Array:
+    """Return the ``(P, 4)`` derivatives of the profile."""
+    down, right = x2 - row, x1 - column  # type: ignore[operator]
+    r2 = down**2 + right**2
+    spot = np.exp(-r2 / (2 * size**2))
+    by_spot = -depth / (1 - depth * spot) * spot / size**2
+    return np.stack(
+        [by_spot * down, by_spot * right, by_spot * r2 / size, -spot / (1 - depth * spot)], axis=-1
+    )
+
+
+def _own(
+    x2: NDArray[np.int64], x1: NDArray[np.int64], place: Array, places: Array, near: list[Array]
+) -> Bools:
+    """Return the pixels that belong to no other candidate."""
+    own = np.ones(x2.shape, bool)
+    here = np.hypot(x2 - place[0], x1 - place[1])
+    for other in places:
+        if (other != place).any() and not any(np.hypot(*(speck[:2] - other)) < _MOVES for speck in near):
+            there = np.hypot(x2 - other[0], x1 - other[1])
+            own &= (there >= here) | (there > _OTHERS)
+    return own
+
+
+def _clarity(series: Array) -> float:
+    """Return the mean of a series over its standard error, told by consecutive parts."""
+    parts = np.array([part.mean() for part in np.array_split(series, min(_PARTS, len(series)))])
+    return float(parts.mean() / (parts.std(ddof=1) / np.sqrt(len(parts)) + 1e-300))
+
+
+def _window(place: Array, shape: tuple[int, ...], reach: int) -> tuple[slice, slice]:
+    rows, columns = (
+        slice(max(0, middle - reach), min(size, middle + reach + 1))
+        for middle, size in zip(np.rint(place).astype(int), shape, strict=True)
+    )
+    return rows, columns
+
+
+def _candidates(standing: Standing, known: Array, reach: Bools) -> Array:
+    """Return the ``(C, 2)`` places where something sharp and round stays, the clearest first."""
+    sharp = _sharp(standing.image - known)
+    parts = np.array([_sharp(part) for part in standing.parts])
+    changes = ndimage.gaussian_filter(parts.var(axis=0, ddof=1), _SHARP[1]) / len(parts)
+    clear = np.abs(sharp) / np.sqrt(changes + standing.error**2 / 4 + 1e-12)
+    top = np.abs(sharp) >= ndimage.maximum_filter(np.abs(sharp), 3)
+    top &= reach & (clear > _SEEN) & (np.abs(sharp) > _FAINTEST / 2) & _is_compact(sharp)
+    places = np.argwhere(top)
+    return np.asarray(places[np.argsort(-clear[top])[:_MOST_AT_ONCE]], dtype=float)
+
+
+def _sharp(image: Array) -> Array:
+    narrow, wide = (ndimage.gaussian_filter(image, size) for size in _SHARP)
+    return np.asarray(narrow - wide)
+
+
+def _is_compact(image: Array) -> Bools:
+    """Tell where an image curves alike in all directions, as a speck does and the particle's edge doesn't."""
+    along, across, mixed = (ndimage.gaussian_filter(image, 1.0, order) for order in ((2, 0), (0, 2), (1, 1)))
+    mean, deviation = (along + across) / 2, np.hypot((along - across) / 2, mixed)
+    return np.asarray(np.abs(mean) - deviation > _ROUND * (np.abs(mean) + deviation))
+
+
+def _fit(
+    standing: Standing, place: Array, specks: list[Array], near: list[int], places: Array
+) -> list[Array] | None:
+    """Return a speck at `place` and those `near` it, fitted together; None where there is none."""
+    rows, columns = _window(place, standing.image.shape, _NEAR)
+    others = render([speck for k, speck in enumerate(specks) if k not in near], standing.image.shape)
+    x2, x1 = np.mgrid[rows, columns]
+    keep = _own(x2, x1, place, places, [specks[k] for k in near])
+    x2, x1 = x2[keep], x1[keep]
+    root = _root_of_covariance(standing, rows, columns, keep)
+
+    def white(values: Array) -> Array:
+        return np.asarray(linalg.solve_triangular(root, values, lower=True, check_finite=False))
+
+    target = white((standing.image - others)[rows, columns][keep])
+
+    def misfit(parameters: Array) -> Array:
+        model = sum(_profile(x2, x1, *speck) for speck in parameters.reshape(-1, 4))
+        return target - white(np.asarray(model))
+
+    def slopes(parameters: Array) -> Array:
+        return -white(
+            np.concatenate([_slopes(x2, x1, *speck) for speck in parameters.reshape(-1, 4)], axis=1)
+        )
+
+    sign = np.sign(_sharp(standing.image - others)[tuple(place.astype(int))])
+    best = None
+    for size in _SIZES:
+        start = np.array([[*place, size, -0.1 * sign], *(specks[k] for k in near)])
+        lower, upper = start - _MOVES, start + _MOVES
+        lower[:, 2:], upper[:, 2:] = (_LEAST_SIZE, -_DEEPEST), (_MOST_SIZE, _DEEPEST)
+        found = optimize.least_squares(
+            misfit, start.ravel(), slopes, bounds=(lower.ravel(), upper.ravel()), xtol=1e-4, ftol=1e-5
+        )
+        if best is None or found.cost < best.cost:
+            best = found
+    assert best is not None
+    fitted = list(best.x.reshape(-1, 4))
+    scatter = max(1.0, np.sqrt(2 * best.cost / len(target)))
+    error = np.sqrt(np.linalg.pinv(best.jac.T @ best.jac)[3, 3]) * scatter
+    size, depth = fitted[0][2:]
+    moved = np.abs(fitted[0][:2] - place).max() > 0.99 * _MOVES
+    if moved or abs(depth) < max(_FAINTEST, _SURE * error) or size > 0.95 * _MOST_SIZE:
+        return None
+    known = others + render(fitted[1:], standing.image.shape)
+    series = white((np.nan_to_num(standing.frames) - known)[:, rows, columns][:, keep].T)
+    here = white(_profile(x2, x1, *fitted[0]))[:, None]
+    along = [_profile(x2, x1, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
+    return fitted if _stays(series, here, white(np.array(along).T)) else None
+
+
+def _stays(series: Array, here: Array, along: Array) -> bool:
+    """Tell whether a spot is always there and stays in place, rather than being carried by the particle.
+
+    Parameters
+    ----------
+    series:
+        ``(P, K)`` frames.
+    here, along:
+        ``(P, 1)`` and ``(P, K)`` the spot in its place and as it would drift with the particle.
+    """
+    shares, in_place = _explained(series, here)
+    gain = _clarity(in_place - _explained(series, along)[1])
+    return _clarity(shares) > (_STEADY if gain > 2 else _VERY_STEADY if gain > -1 else np.inf)
+
+
+def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
+    """Return how much of the spot is in each frame, and by how much its mean explains that."""
+    square = np.sum(np.broadcast_to(spot, series.shape) ** 2, axis=0)
+    product = np.sum(spot * series, axis=0)
+    share = product.sum() / square.sum()
+    return product / square, 2 * share * product - share**2 * square
+
+
+def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> Array:
+    """Return the Cholesky factor of the covariance of the mean projection, its noise, and any plane."""
+    frames = np.nan_to_num(standing.frames[:, rows, columns])
+    height, width = frames.shape[1:]
+    taper = np.multiply.outer(*(np.hanning(size + 2)[1:-1] for size in (height, width)))
+    changes = (frames - frames.mean(axis=0)) * taper
+    power = np.mean(np.abs(np.fft.fft2(changes, s=(2 * height, 2 * width))) ** 2, axis=0)
+    by_lag = np.fft.ifft2(power).real / np.sum(taper**2)
+    x2, x1 = (axis[keep] for axis in np.mgrid[:height, :width])
+    covariance = by_lag[x2[:, None] - x2, x1[:, None] - x1] / _INDEPENDENT
+    covariance[np.diag_indices_from(covariance)] += standing.error**2 + 1e-10
+    plane = np.stack([np.ones(len(x1)), (x1 - x1.mean()) / width, (x2 - x2.mean()) / height], axis=1)
+    covariance += plane @ plane.T
+    return np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False))
