@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
 from trapcli.motion.branch import Evidence, Hypothesis, find_branches
-from trapcli.motion.centers import Centers, Progress, estimate_centers, object_radius, sample_frames
+from trapcli.motion.centers import Centers, Progress
 from trapcli.motion.common_line import LineTable
-from trapcli.motion.low_band import LowBand, read_low_band
+from trapcli.motion.front_end import read_front_end
+from trapcli.motion.low_band import LowBand
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Path, Spline
-from trapcli.motion.reduced_map import reduce_frames
 from trapcli.motion.translation import translation
 from trapcli.motion.types import ReducedMap
 from trapcli.result.motion import Flag, Motion
@@ -31,8 +31,6 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _FEWEST = 12  # frames
-_LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the model's own errors dominate
-_LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
 _LINE_BAND = 8.0  # band times radius for common lines
 _COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
 _FINE_BAND = 16.0  # band times radius of the object model in the end
@@ -92,20 +90,22 @@ def estimate_joint(
     InputError
         Where fewer than 12 frames show an object.
     """
-    centers = _estimate_centers(attenuation, pixel_size, progress)
+    front = read_front_end(
+        attenuation,
+        time=time,
+        pixel_size=pixel_size,
+        line_band=_LINE_BAND,
+        fine_band=_FINE_BAND,
+        band=config.band,
+        progress=progress,
+    )
+    centers, reduced, low = front.centers, front.reduced, front.low
     seen = np.asarray(np.isfinite(centers.center).all(axis=1))
     if seen.sum() < _FEWEST:
         raise InputError(
             f"{attenuation.info.source}: {seen.sum()} frames show an object; at least {_FEWEST} are needed"
         )
-    line_band = min(_LINE_BAND / centers.radius, config.band or np.inf)
     fine_band = config.band or _FINE_BAND / centers.radius
-    reduced = reduce_frames(
-        attenuation, centers, time=time, pixel_size=pixel_size, band=line_band, progress=progress
-    )
-    low = read_low_band(
-        attenuation, centers, time=time, band=fine_band, pixel_size=pixel_size, progress=progress
-    )
     outlying = np.zeros(len(time), bool)
     outlying[seen] = _outliers(low.select(np.flatnonzero(seen)))
     stack = _Stack(reduced, low, centers, seen, outlying, attenuation.index)
@@ -139,17 +139,6 @@ class _Stack:
 class _Verdict:
     identifiable: bool
     text: str
-
-
-def _estimate_centers(attenuation: Frames, pixel_size: float, progress: Progress | None) -> Centers:
-    """Return the centres, with a radius and a noise that suit the low band."""
-    centers = estimate_centers(attenuation, pixel_size=pixel_size, progress=progress)
-    survey = sample_frames(attenuation)
-    if not len(survey):
-        return centers
-    peak = float(np.quantile(survey, 0.9999) - np.median(survey))
-    radius = object_radius(survey, max(centers.noise, _LEAST_VISIBLE * peak)) * pixel_size
-    return replace(centers, radius=min(radius, centers.radius), noise=max(centers.noise, _LEAST_NOISE * peak))
 
 
 def _outliers(low: LowBand) -> Bools:
