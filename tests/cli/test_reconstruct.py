@@ -73,6 +73,17 @@ def test_volume_beside_the_result(folder, capfd):
     assert "--overwrite" in one_line(capfd)
 
 
+def test_figure_of_the_volume(folder, capfd):
+    result, volume = folder / "plain-truth.h5", folder / "plain-truth-volume.tif"
+    assert call("plot", result, "--volume", volume) == 3
+    assert call("reconstruct", folder / "plain.tif", result) == 0
+    capfd.readouterr()
+    assert call("plot", result, "--volume", volume) == 0
+    assert capfd.readouterr().out == f"{folder / 'plain-truth-volume.png'}\n"
+    assert call("plot", result, "--volume", volume, "--time-step", "3", "--overwrite") == 2
+    assert "--volume" in one_line(capfd)
+
+
 @pytest.mark.parametrize("ending", ["mrc", "h5"])
 def test_json(folder, capfd, ending):
     output = folder / f"a.{ending}"

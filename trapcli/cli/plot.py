@@ -32,6 +32,7 @@ PROJECTIONS = 4
     metavar="N",
     help="Frame whose projection and Phi are shown; may be repeated.",
 )
+@click.option("--volume", type=PATH, help="Draw this volume of RESULT in place of the motion.")
 @overwrite_option
 @console_options
 def command(
@@ -40,13 +41,16 @@ def command(
     truth: Path | None,
     stack: str | None,
     steps: tuple[int, ...],
+    volume: Path | None,
     overwrite: bool,
     console: Console,
 ) -> None:
     """Draw translation, phi, omega_3 and alpha of RESULT on one page.
 
     With --truth the exact curves and the errors are added, with --stack some projections. The function Phi is
-    shown where RESULT has it (--method paper). The name of the figure goes to stdout.
+    shown where RESULT has it (--method paper). With --volume the figure shows slices, maximum projections,
+    resolution and coverage of what reconstruct wrote, by default as VOLUME.png. The name of the figure goes
+    to stdout.
     """
     from trapcli.atomic import atomic_path, check_output
     from trapcli.errors import ConfigError, InputError
@@ -54,12 +58,19 @@ def command(
     from trapcli.report.projections import choose, read_projections
     from trapcli.result.motion import Motion
 
-    output = output or result.with_suffix(".png")
+    output = output or (volume or result).with_suffix(".png")
     suffix = output.suffix.lower()
     if suffix not in figures.FORMATS:
         raise ConfigError(f"{output}: no known kind of figure; end the name in {', '.join(figures.FORMATS)}")
-    refuse_input(output, result, *(Path(path) for path in (truth, stack) if path))
+    refuse_input(output, result, *(Path(path) for path in (truth, stack, volume) if path))
     check_output(output, overwrite)
+    if volume:
+        if truth or stack or steps:
+            raise ConfigError(
+                "--volume: leave out --truth, --stack and --time-step, which are for the motion"
+            )
+        _draw_volume(result, volume, output, overwrite)
+        return
     motion = Motion.load(result)
     exact = Motion.load(truth) if truth else None
     shown = steps or motion.frame[choose(motion, PROJECTIONS)].tolist()
@@ -71,6 +82,20 @@ def command(
         raise InputError(f"{result} and {truth}: {error}") from None
     with atomic_path(output, overwrite) as temporary:
         figures.save(figure, temporary, suffix)
+    print_path(output)
+
+
+def _draw_volume(result: Path, volume: Path, output: Path, overwrite: bool) -> None:
+    from trapcli.atomic import atomic_path
+    from trapcli.reconstruction.volume_files import read_judgement, read_volume
+    from trapcli.report import figures
+    from trapcli.report.volume_page import draw_volume
+
+    values, voxel_size, unit = read_volume(volume)
+    judgement = read_judgement(result, volume)
+    figure = draw_volume(values, voxel_size, unit, judgement=judgement, title=volume.name)
+    with atomic_path(output, overwrite) as temporary:
+        figures.save(figure, temporary, output.suffix.lower())
     print_path(output)
 
 

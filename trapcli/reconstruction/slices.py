@@ -88,7 +88,7 @@ def survey(frames: Frames, motion: Motion, pixel_size: float) -> Survey:
     images = sample_frames(frames)
     if not len(images):
         raise InputError(f"{frames.info.source}: shows no object; no frame sampled has finite values")
-    peak = float(np.quantile(images, 0.9999) - np.median(images))
+    peak = float(np.quantile(np.abs(images - np.median(images)), 0.9999))
     noise = pixel_noise(images)
     radius = min(object_radius(images, max(noise, _LEAST_VISIBLE * peak)), max(frames.shape[1:]) / 2)
     return Survey(

@@ -18,6 +18,7 @@ from trapcli.config import InputConfig
 from trapcli.errors import ConfigError, InputError, OutputError
 from trapcli.reconstruction.units import ANGSTROMS
 from trapcli.reconstruction.volume import Reconstruction
+from trapcli.report.volume_page import Judgement
 from trapcli.result.motion import Motion
 from trapcli.stack import open_stack
 from trapcli.stack.frames import single_frames
@@ -177,7 +178,9 @@ def record(result: Path, volume: Reconstruction, path: Path) -> None:
         if GROUP in file:
             del file[GROUP]
         group = file.create_group(GROUP)
-        group.attrs.update(NX_class="NXdata", signal="residual", axes="time", volume=_clean(str(path)))
+        group.attrs.update(
+            NX_class="NXdata", signal="residual", axes="time", volume=_clean(str(path.resolve()))
+        )
         group.attrs["auxiliary_signals"] = np.array(["misfit", "held_out"], dtype=_TEXT)
         group["time"] = file["motion/time"]
         for name in ("residual", "misfit", "held_out"):
@@ -212,6 +215,29 @@ def _put_quality(parent: h5py.Group, volume: Reconstruction) -> None:
 
 def _clean(text: str) -> str:
     return text.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
+
+
+def read_judgement(result: Path, volume: Path) -> Judgement | None:
+    """Read what `record` wrote beside the motion; None where that is of another volume, or nothing.
+
+    Raises
+    ------
+    InputError
+        Where `result` is no result.
+    """
+    Motion.load(result)
+    with h5py.File(result, "r", locking=False) as file:
+        if GROUP not in file or file[GROUP].attrs.get("volume") != _clean(str(volume.resolve())):
+            return None
+        group = file[GROUP]
+        shells, sphere = group["shell_correlation"], group["coverage"]
+        return Judgement(
+            shells["frequency"][()],
+            shells["correlation"][()],
+            sphere["direction"][()],
+            sphere["times_seen"][()],
+            float(sphere["share"][()]),
+        )
 
 
 def read_volume(path: Path) -> tuple[NDArray[Any], float, str]:
