@@ -79,7 +79,6 @@ def test_auto_sees_that_a_median_keeps_an_object_that_stays(field: np.ndarray) -
     wobble = np.random.default_rng(0).normal(scale=0.7, size=(60, 2))
     truth = discs(wobble)
     smooth = np.full((SIZE, SIZE), 30_000.0)
-    assert np.abs(attenuation_of(raw(truth, smooth), "median") - truth).max() > 0.3
     assert np.abs(attenuation_of(raw(truth, smooth), "auto") - truth).max() < 0.01
 
 
@@ -151,12 +150,14 @@ def test_missing_background_names_the_file(moving: np.ndarray, field: np.ndarray
         attenuation_of(raw(moving, field), "no such place.tif")
 
 
-def test_median_says_that_an_object_stays() -> None:
-    truth = discs(np.random.default_rng(0).normal(scale=0.7, size=(60, 2)))
-    frames = Frames.from_array(raw(truth, np.full((SIZE, SIZE), 30_000.0)))
-    info = to_attenuation(frames, PreprocessConfig(background="median")).info
-    assert "median" in info.notes[0]
-    assert "covers" in info.warnings[0]
+@pytest.mark.parametrize("path", [0.7, 2.0, 4.0], ids=lambda path: f"{path} pixels")
+def test_median_refuses_an_object_that_stays(path: float) -> None:
+    angle = np.linspace(0, 4 * np.pi, 60)
+    truth = discs(path * np.stack([np.cos(angle), np.sin(angle)], axis=1), radius=12)
+    frames = raw(truth, np.full((SIZE, SIZE), 30_000.0))
+    with pytest.raises(InputError, match=r"array: the particle stays.*--background surface"):
+        attenuation_of(frames, "median")
+    assert np.abs(attenuation_of(frames, "auto") - truth).max() < 0.01
 
 
 def test_auto_says_which_background_it_took_and_why(moving: np.ndarray, field: np.ndarray) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trapcli.config import PreprocessConfig
 from trapcli.errors import InputError
 from trapcli.preprocess.counts import Counts, mean_image
-from trapcli.preprocess.surface import Light, border, fit_empty_field, median_field
+from trapcli.preprocess.surface import EmptyField, Light, border, fit_empty_field, median_field
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 _FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
 _LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
 _COVERED = 0.01  # share of the pixels that may be free less often
+_IMPRINT = 0.05  # darkness of a median where the particle stays, as a share of its depth, that shows it
 _FULL = 0.05  # share of free pixels below which little tells the empty field
 
 
@@ -77,8 +78,8 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     ConfigError
         For a dark level that is no level.
     InputError
-        Where background or dark frames can't be read or don't fit; while reading, where most frames hold no
-        light.
+        Where background or dark frames can't be read or don't fit, or a median shows the particle itself;
+        while reading, where most frames hold no light.
     """
     if config.attenuation:
         return frames
@@ -160,7 +161,15 @@ def _find_background(
     fitted = fit_empty_field(sample)
     covered = float(np.mean(fitted.outside < _LEAVES))
     if source == "median" or (source == "auto" and covered <= _COVERED):
-        return _median(sample, covered)
+        field = median_field(sample)
+        shown = _imprint(field, fitted, sample)
+        if shown <= _COVERED:
+            return _median(field, covered)
+        if source == "median":
+            raise InputError(
+                f"{frames.info.source}: the particle stays over {max(covered, shown):.0%} of the frame, so "
+                "its median in time shows the particle; give --background surface, or a file of the empty field"
+            )
     note = (
         f"background: a surface of degree {fitted.degree} and {fitted.specks} specks; "
         f"the particle stays over {covered:.0%} of the frame"
@@ -170,15 +179,19 @@ def _find_background(
     return _Background(_lit(fitted.log_light, fitted.light), note, (unsure,) * filled)
 
 
-def _median(sample: NDArray[np.float32], covered: float) -> _Background:
-    field = median_field(sample)
+def _median(field: Array, covered: float) -> _Background:
     note = f"background: median in time; the particle leaves {1 - covered:.0%} of the frame most of the time"
-    doubt = (
-        f"the particle covers {covered:.0%} of the frame most of the time, so the median shows it; "
-        "give the background as a file, or take surface"
-    )
-    light = Light.over(border(field.shape))
-    return _Background(_lit(field, light), note, (doubt,) * (covered > _COVERED))
+    return _Background(_lit(field, Light.over(border(field.shape))), note)
+
+
+def _imprint(field: Array, fitted: EmptyField, sample: NDArray[np.float32]) -> float:
+    """Return the share of pixels in which a field is darker than the fitted one where the particle stays."""
+    stays = fitted.outside < _LEAVES
+    missing = fitted.log_light - field
+    if not stays.all():
+        missing -= np.nanmedian(missing[~stays])
+    depth = np.nanquantile(fitted.log_light - sample, 0.999)
+    return float(np.mean(stays & (missing > _IMPRINT * depth)))
 
 
 def _lit(field: Array, light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:
