@@ -168,7 +168,7 @@ def _find_background(
         if source == "median":
             raise InputError(
                 f"{frames.info.source}: the particle stays over {max(covered, shown):.0%} of the frame, so "
-                "its median in time shows the particle; give --background surface, or a file of the empty field"
+                "its median shows it; give --background surface, or a file of the empty field"
             )
     note = (
         f"background: a surface of degree {fitted.degree} and {fitted.specks} specks; "
