@@ -5,6 +5,8 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 TOOLS  := $(VENV)/.tools
 TRAP   := ../$(BIN)/trap-motion
+# setuptools warns of editable installs, which are meant here
+PIP    := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 # the tests' matrices are small, and several processes run at once
 export OMP_NUM_THREADS ?= 1
@@ -14,13 +16,13 @@ export OMP_NUM_THREADS ?= 1
 setup: $(STAMP)
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade pip
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e .
+	$(PIP) --upgrade pip
+	$(PIP) -e .
 	@touch $@
 
 # what only tests, checks and documentation need: a first result shouldn't wait for it
 $(TOOLS): $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,lint,docs]'
+	$(PIP) -e '.[test,lint,docs]'
 	@touch $@
 
 # the paper's example: a stack with its true motion, both methods, errors and figures
