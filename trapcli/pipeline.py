@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from trapcli.config import EstimateConfig, to_toml
 from trapcli.errors import ConfigError, InputError
@@ -92,9 +93,11 @@ def estimate(
     frames = replace(frames, info=calibrated(frames.info, config.input))
     step, time_unit, pixel, length_unit = _units(frames)
     projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
-    motion = recover(
-        projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
-    )
+    # the matrices are small and many: threads that share one spend most of their time waiting for each other
+    with threadpool_limits(1, user_api="blas"):
+        motion = recover(
+            projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
+        )
     origin = provenance.collect(configuration=to_toml(config))
     if warnings := _warnings(projections, config):
         origin["warnings"] = "\n".join(warnings)

@@ -89,6 +89,12 @@ def _roi(_context: click.Context, _option: click.Parameter, value: str | None) -
 @config_option
 @click.option("--jobs", type=click.IntRange(1, 1024), metavar="N", help="Inputs at a time.  [default: 1]")
 @click.option(
+    "--threads",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Threads that work on one input.  [default: as many as there are cores for it]",
+)
+@click.option(
     "--scheduler",
     metavar="ADDRESS",
     help="Let the workers of this Dask scheduler do it; they share the files.",
@@ -103,6 +109,7 @@ def command(
     output: Path | None,
     config: Path | None,
     jobs: int | None,
+    threads: int | None,
     scheduler: str | None,
     resume: bool,
     summary: Path | None,
@@ -120,6 +127,8 @@ def command(
     The paths of the results go to stdout. Exit code 4: a result is written, but the frames do not tell the
     motion; 1: some of several inputs failed.
     """
+    if threads is not None:  # read when the numerical libraries are loaded, here and in processes of --jobs
+        os.environ["OMP_NUM_THREADS"] = str(threads)
     resolved = resolve_config(EstimateConfig, config, _tables(options))
     if output and len(inputs) > 1:
         raise ConfigError("-o: is for a single input; results of several lie beside them")
