@@ -11,6 +11,8 @@ The pipeline, as in the workflow figure of Elbau et al. 2020 (Inverse Problems 3
     R            ω integrated on SO(3)                                 trapcli.motion.integrate
     Motion       all of it, with errors, flags, units and provenance   trapcli.result
 
+and with the motion the object itself, by `reconstruct`                trapcli.reconstruction
+
 >>> import trapcli
 >>> frames, truth = trapcli.simulate(stack={"frames": 50, "height": 64, "width": 64, "pixel_size": 0.4})
 >>> motion = trapcli.estimate(frames, attenuation=True, frame_interval=0.0025, method="paper")
@@ -25,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from trapcli.pipeline import estimate as estimate
+    from trapcli.reconstruction.volume import reconstruct as reconstruct
     from trapcli.result.comparison import compare as compare
     from trapcli.result.motion import Motion as Motion
     from trapcli.simulation.render import simulate as simulate
@@ -33,10 +36,11 @@ _PUBLIC = {
     "Motion": "trapcli.result.motion",
     "compare": "trapcli.result.comparison",
     "estimate": "trapcli.pipeline",
+    "reconstruct": "trapcli.reconstruction.volume",
     "simulate": "trapcli.simulation.render",
 }
 
-__all__ = ["Motion", "compare", "estimate", "simulate"]
+__all__ = ["Motion", "compare", "estimate", "reconstruct", "simulate"]
 
 
 def __getattr__(name: str) -> Any:

@@ -170,6 +170,27 @@ def test_too_few_frames(example):
         reconstruct(case.frames, motion)
 
 
+def test_arrays_and_the_public_name(example):
+    import trapcli
+
+    case = example(**FULL)
+    found = trapcli.reconstruct(case.frames.to_array(), case.motion, pixel_size=case.pixel_size, voxels=24)
+    assert found.values.shape == (24, 24, 24)
+    with pytest.raises(InputError, match="has 9 frames where the motion has 120"):
+        trapcli.reconstruct(case.frames.to_array()[:9], case.motion)
+
+
+def test_noisy_frames_count_less(example):
+    """A third of the frames with ten times the noise hardly do harm."""
+    case = example(noise=0.01, **FULL)
+    frames = case.frames.to_array().copy()
+    extra = 0.1 * frames.max() * np.random.default_rng(0).standard_normal(frames[::3].shape)
+    frames[::3] += extra.astype(frames.dtype)
+    found = reconstruct(frames, case.motion, pixel_size=case.pixel_size)
+    assert correlation(found.values, case.true(found)) > 0.995
+    assert np.median(found.misfit) < 1.2
+
+
 @pytest.mark.parametrize("voxels", [-1, 3, 4000])
 def test_impossible_numbers_of_voxels(example, voxels):
     case = example(**FULL)

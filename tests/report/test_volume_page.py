@@ -53,7 +53,7 @@ def test_judgement_and_file(volume, tmp_path):
     judgement = Judgement(np.arange(4.0), np.array([1, 0.9, 0.4, 0.1]), direction, np.array([0, 1, 7]), 2 / 3)
     figure = draw_volume(volume, 0.5, "µm", judgement=judgement, title="a $volume$")
     shown = panels(figure)
-    assert "directions seen: 67 %, red: unseen" in shown
+    assert "seen: 67 %, red: not seen" in shown
     np.testing.assert_array_equal(shown["half-sets: Fourier shell correlation"].lines[0].get_ydata()[2], 0.4)
     save(figure, tmp_path / "a.png", ".png")
     assert (tmp_path / "a.png").stat().st_size > 10_000

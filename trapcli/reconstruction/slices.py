@@ -26,6 +26,7 @@ _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which errors of the 
 _LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
 _OUTSIDE = 1.2  # radii of the object beyond which the field is empty
 _FEWEST_OUTSIDE = 0.05  # share of the frame that must lie there to tell the empty field's level
+_ENOUGH = 256  # pixels across that tell noise and level
 _POINTS = 1 << 20  # modes in a block
 _FEWEST = 3  # frames
 
@@ -158,6 +159,7 @@ class SliceReader:
         self.k = 2 * np.pi / voxels * np.stack([m1[kept], m2[kept]], axis=1)
         self.share = np.where((self.k == 0).all(axis=1), 1.0, 2.0)
         self.scale = 1 / (edge * survey.noise)
+        self._noise = np.full(len(frames), np.nan)
 
     @property
     def count(self) -> int:
@@ -167,12 +169,14 @@ class SliceReader:
     def blocks(self) -> Iterator[Slices]:
         """Yield the used frames in order."""
         size = max(1, _POINTS // len(self.k))
-        taken: list[tuple[int, Complex, float]] = []
+        taken: list[tuple[int, Complex]] = []
         done = 0
         for block in self.frames.blocks():
             for image in block:
                 if self.survey.use[done] and np.isfinite(image).all():
-                    taken.append((done, *self._modes(image, self.survey.center[done])))
+                    if np.isnan(self._noise[done]):
+                        self._noise[done] = pixel_noise(_middle(image)[None])
+                    taken.append((done, self._modes(image, self.survey.center[done])))
                     if len(taken) == size:
                         yield self._slices(taken)
                         taken = []
@@ -180,14 +184,13 @@ class SliceReader:
         if taken:
             yield self._slices(taken)
 
-    def _slices(self, taken: list[tuple[int, Complex, float]]) -> Slices:
-        frame = np.array([at for at, _, _ in taken])
-        noise = np.array([own for _, _, own in taken])
-        weight = np.minimum(1.0, (self.survey.noise / np.maximum(noise, 1e-300)) ** 2)
-        return Slices(frame, self.survey.R[frame], np.array([modes for _, modes, _ in taken]), weight)
+    def _slices(self, taken: list[tuple[int, Complex]]) -> Slices:
+        frame = np.array([at for at, _ in taken])
+        weight = np.minimum(1.0, (self.survey.noise / np.maximum(self._noise[frame], 1e-300)) ** 2)
+        return Slices(frame, self.survey.R[frame], np.array([modes for _, modes in taken]), weight)
 
-    def _modes(self, image: NDArray[Any], center: Array) -> tuple[Complex, float]:
-        """Return the whitened modes of one frame about its centre, and the noise of its pixels."""
+    def _modes(self, image: NDArray[Any], center: Array) -> Complex:
+        """Return the whitened modes of one frame about its centre."""
         edge = self.survey.edge
         whole = np.round(center).astype(int)
         square = cut(image, whole, edge, empty_level(image, center, self.survey.radius))
@@ -196,7 +199,7 @@ class SliceReader:
         ]
         pixel_k = self.k * (self.voxels / edge)
         modes = self.scale * spectrum * np.exp(1j * pixel_k @ (center - whole))
-        return modes.astype(np.complex64), pixel_noise(image[None])
+        return np.asarray(modes, np.complex64)
 
 
 def cut(image: NDArray[Any], middle: NDArray[np.int_], edge: int, level: float) -> Array:
@@ -217,10 +220,17 @@ def cut(image: NDArray[Any], middle: NDArray[np.int_], edge: int, level: float) 
     return square
 
 
+def _middle(image: NDArray[Any]) -> NDArray[Any]:
+    """Return at most `_ENOUGH` rows and columns about the middle, which tell the noise."""
+    top, left = (max(0, (size - _ENOUGH) // 2) for size in image.shape)
+    return image[top : top + _ENOUGH, left : left + _ENOUGH]
+
+
 def empty_level(image: NDArray[Any], center: Array, radius: float) -> float:
     """Return the median of the empty field around the object; 0 where the object fills the frame."""
     height, width = image.shape
-    x2 = np.arange(height)[:, None] - height // 2 - center[1]
-    x1 = np.arange(width) - width // 2 - center[0]
+    step = max(1, min(image.shape) // _ENOUGH)
+    x2 = np.arange(0, height, step)[:, None] - height // 2 - center[1]
+    x1 = np.arange(0, width, step) - width // 2 - center[0]
     outside = x1**2 + x2**2 > (_OUTSIDE * radius) ** 2
-    return float(np.median(image[outside])) if outside.mean() > _FEWEST_OUTSIDE else 0.0
+    return float(np.median(image[::step, ::step][outside])) if outside.mean() > _FEWEST_OUTSIDE else 0.0

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trapcli.errors import ConfigError
+from trapcli.errors import ConfigError, InputError
 from trapcli.reconstruction.coverage import Coverage, cover
 from trapcli.reconstruction.fourier_slices import project, slice_points
 from trapcli.reconstruction.resolution import Resolution, resolve
@@ -63,7 +64,7 @@ class Reconstruction:
 
 
 def reconstruct(
-    frames: Frames,
+    frames: Frames | NDArray[Any],
     motion: Motion,
     *,
     pixel_size: float = 1.0,
@@ -77,7 +78,7 @@ def reconstruct(
     Parameters
     ----------
     frames:
-        N attenuation projections.
+        ``(N, H, W)`` attenuation projections; an array, or `Frames` that are read as often as needed.
     motion:
         Of these frames.
     pixel_size:
@@ -101,6 +102,13 @@ def reconstruct(
     """
     if voxels and not _VOXELS[0] <= voxels <= _VOXELS[1]:
         raise ConfigError(f"--voxels {voxels}: must lie between {_VOXELS[0]} and {_VOXELS[1]}")
+    if not isinstance(frames, Frames):
+        frames = Frames.from_array(frames)
+    if len(frames) != len(motion):
+        raise InputError(
+            f"{frames.info.source}: has {len(frames)} frames where the motion has {len(motion)}; "
+            "they don't belong together"
+        )
     found = survey(frames, motion, pixel_size)
     n = voxels or min(found.edge, MOST_VOXELS)
     reader = SliceReader(frames, found, n)

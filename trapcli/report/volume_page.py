@@ -118,6 +118,4 @@ def _draw_sphere(axes: Axes, judgement: Judgement) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
     axes.set_xlabel("x₁, x₂ of the object; x₃ in the middle")
-    axes.set_title(
-        f"directions seen: {100 * judgement.share:.0f} %" + ("" if seen.all() else ", red: unseen")
-    )
+    axes.set_title(f"seen: {100 * judgement.share:.0f} %" + ("" if seen.all() else ", red: not seen"))
