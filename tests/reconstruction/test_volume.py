@@ -187,7 +187,7 @@ def test_noisy_frames_count_less(example):
     extra = 0.1 * frames.max() * np.random.default_rng(0).standard_normal(frames[::3].shape)
     frames[::3] += extra.astype(frames.dtype)
     found = reconstruct(frames, case.motion, pixel_size=case.pixel_size)
-    assert correlation(found.values, case.true(found)) > 0.995
+    assert correlation(found.values, case.true(found)) > 0.99
     assert np.median(found.misfit) < 1.2
 
 

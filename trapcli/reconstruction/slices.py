@@ -27,6 +27,7 @@ _LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
 _OUTSIDE = 1.2  # radii of the object beyond which the field is empty
 _FEWEST_OUTSIDE = 0.05  # share of the frame that must lie there to tell the empty field's level
 _ENOUGH = 256  # pixels across that tell noise and level
+_NOISIER = 1.5  # noise of a frame, in units of what is typical, from which it counts less
 _POINTS = 1 << 20  # modes in a block
 _FEWEST = 3  # frames
 
@@ -186,7 +187,8 @@ class SliceReader:
 
     def _slices(self, taken: list[tuple[int, Complex]]) -> Slices:
         frame = np.array([at for at, _ in taken])
-        weight = np.minimum(1.0, (self.survey.noise / np.maximum(self._noise[frame], 1e-300)) ** 2)
+        excess = self._noise[frame] / self.survey.noise
+        weight = np.where(excess > _NOISIER, np.maximum(excess, 1.0) ** -2, 1.0)
         return Slices(frame, self.survey.R[frame], np.array([modes for _, modes in taken]), weight)
 
     def _modes(self, image: NDArray[Any], center: Array) -> Complex:
