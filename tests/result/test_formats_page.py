@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import h5py
 import pytest
 
 from trapcli.result.motion import FLAG_MEANINGS
@@ -30,3 +31,14 @@ def test_every_path_is_described():
 def test_every_flag_is_described():
     rows = re.findall(r"^\| (\d+) \|", PAGE, re.MULTILINE)
     assert [int(row) for row in rows] == [int(flag) for flag in FLAG_MEANINGS]
+
+
+@pytest.mark.parametrize("language", ["matlab", "julia"])
+def test_what_other_languages_read_is_there(language, make_motion, tmp_path):
+    make_motion().save(tmp_path / "result.h5")
+    (example,) = re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    paths = re.findall(r"""["']/?(motion/[\w/]+)["']""", example)
+    assert len(paths) >= 4
+    with h5py.File(tmp_path / "result.h5") as file:
+        for path in paths:
+            assert "units" in file[path].attrs
