@@ -247,7 +247,7 @@ def test_what_does_not_go_with_a_scheduler(
     stacks: Any, estimate: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = stacks(1)
-    for arguments in ((*names, "--jobs", 2), ("-", "-o", "a.h5")):
+    for arguments in ((*names, "--jobs", 2), (*names, "--threads", 2), ("-", "-o", "a.h5")):
         code, _, err = estimate(*arguments, "--scheduler", "tcp://127.0.0.1:1")
         assert (code, err.count("\n")) == (2, 1)
     monkeypatch.setitem(sys.modules, "dask", None)

@@ -132,8 +132,8 @@ def command(
     resolved = resolve_config(EstimateConfig, config, _tables(options))
     if output and len(inputs) > 1:
         raise ConfigError("-o: is for a single input; results of several lie beside them")
-    if scheduler is not None and (jobs is not None or STANDARD_INPUT in inputs):
-        raise ConfigError("--scheduler: goes neither with --jobs nor with standard input")
+    if scheduler is not None and (jobs is not None or threads is not None or STANDARD_INPUT in inputs):
+        raise ConfigError("--scheduler: goes with neither --jobs nor --threads nor standard input")
     planned = [
         Job(source, output or _output_for(source), resolved, command_line(), overwrite) for source in inputs
     ]
