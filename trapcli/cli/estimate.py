@@ -127,13 +127,13 @@ def command(
     The paths of the results go to stdout. Exit code 4: a result is written, but the frames do not tell the
     motion; 1: some of several inputs failed.
     """
+    if scheduler is not None and (jobs is not None or threads is not None or STANDARD_INPUT in inputs):
+        raise ConfigError("--scheduler: goes with neither --jobs nor --threads nor standard input")
     if threads is not None:  # read when the numerical libraries are loaded, here and in processes of --jobs
         os.environ["OMP_NUM_THREADS"] = str(threads)
     resolved = resolve_config(EstimateConfig, config, _tables(options))
     if output and len(inputs) > 1:
         raise ConfigError("-o: is for a single input; results of several lie beside them")
-    if scheduler is not None and (jobs is not None or threads is not None or STANDARD_INPUT in inputs):
-        raise ConfigError("--scheduler: goes with neither --jobs nor --threads nor standard input")
     planned = [
         Job(source, output or _output_for(source), resolved, command_line(), overwrite) for source in inputs
     ]
