@@ -80,7 +80,7 @@ def test_output_that_is_an_input(tmp_path):
 
 def test_commands_load_without_numpy():
     """``--help`` must answer at once."""
-    names = ("compare", "export", "plot", "options")
+    names = ("compare", "export", "plot", "reconstruct", "align", "options")
     imports = "; ".join(f"import trapcli.cli.{name}" for name in names)
     subprocess.run(
         [sys.executable, "-c", f"{imports}; import sys; assert 'numpy' not in sys.modules"], check=True

@@ -74,6 +74,7 @@ def command(
     check_ending(output)
     refuse_input(output, result, Path(stack))
     check_output(output, overwrite)
+    check_output(result, overwrite=True)  # figures about the volume are added to it
     prepared = prepare(stack, result, Changes(**changes))
     for warning in prepared.frames.info.warnings:
         console.warn(f"{stack}: {warning}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -226,7 +227,7 @@ def read_judgement(result: Path, volume: Path) -> Judgement | None:
         Where `result` is no result.
     """
     Motion.load(result)
-    with h5py.File(result, "r", locking=False) as file:
+    with suppress(KeyError, OSError, ValueError, TypeError), h5py.File(result, "r", locking=False) as file:
         if GROUP not in file or file[GROUP].attrs.get("volume") != _clean(str(volume.resolve())):
             return None
         group = file[GROUP]
@@ -238,6 +239,7 @@ def read_judgement(result: Path, volume: Path) -> Judgement | None:
             sphere["times_seen"][()],
             float(sphere["share"][()]),
         )
+    return None
 
 
 def read_volume(path: Path) -> tuple[NDArray[Any], float, str]:
