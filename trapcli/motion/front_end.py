@@ -91,8 +91,9 @@ def read_front_end(
                 if tracker.follow(image):
                     whole[i] = np.round(tracker.place[i])
                     square = cut_square(image, whole[i], half, tracker.level[i])
-                    lines.read(i, _middle(square, lines.half))
-                    low.read(i, _middle(square, low.half))
+                    rest = (tracker.place[i] - whole[i]) * b * pixel_size
+                    lines.read(i, _middle(square, lines.half), rest)
+                    low.read(i, _middle(square, low.half), rest)
             if progress is not None:
                 progress("frames", tracker.done, n)
     centers = tracker.centers(shape, pixel_size, cells)

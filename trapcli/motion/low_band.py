@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complex128]
 SQUARE = 1.15
 """Half the edge of the square, in radii of the object."""
 
+_DISC = 1.1  # radius of the disc that moments are taken in, in radii of the object
 _POWERS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
 
@@ -131,7 +132,8 @@ def read_low_band(
             center = centers.center[done] / pixel_size
             if np.isfinite(center).all():
                 whole = np.round(center).astype(int)
-                reader.read(done, cut_square(image, whole, reader.half, centers.level[done]))
+                square = cut_square(image, whole, reader.half, centers.level[done])
+                reader.read(done, square, (center - whole) * pixel_size)
             done += 1
         if progress is not None:
             progress("low band", done, len(attenuation))
@@ -178,16 +180,31 @@ class LowBandReader:
         taken = transfer(self.k, binning, pixel_size).prod(axis=1)
         self._factor = cell**2 / (2 * np.pi) / taken
         self._wave = np.exp(-1j * np.outer(frequency, offset))
-        weight, monomials = _monomials(offset, radius)
-        self._moment_weights = np.stack([(weight * m).ravel() for m in monomials])
+        self._offset = offset
+        x1, x2 = np.meshgrid(offset / radius, offset / radius)
+        self._monomials = np.stack([(x1**a * x2**b).ravel() for a, b in _POWERS])
         self._modes = np.full((count, len(self.k)), np.nan, complex)
-        self._moments = np.full((count, len(monomials)), np.nan)
+        self._moments = np.full((count, len(_POWERS)), np.nan)
 
-    def read(self, n: int, square: Array) -> None:
-        """Read frame `n` off the square about a cell."""
+    def read(self, n: int, square: Array, rest: Array) -> None:
+        """Read frame `n` off the square about a cell.
+
+        Parameters
+        ----------
+        rest:
+            ``(2,)`` roughly the object's centre, from that cell [length].
+        """
         inside = square[:-1, :-1]
         self._modes[n] = ((self._wave @ inside) @ self._wave.T).ravel()[self._kept]
-        self._moments[n] = self._moment_weights @ inside.ravel()
+        self._moments[n] = self._monomials @ (inside * self._disc(rest)).ravel()
+
+    def _disc(self, center: Array) -> Array:
+        """Return the disc inside which moments are taken, with an edge of two cells."""
+        distance: Array = (self._offset - center[0]) ** 2 + ((self._offset - center[1]) ** 2)[:, None]
+        np.sqrt(distance, out=distance)
+        distance *= -1 / (2 * self._cell)
+        distance += _DISC * self._radius / (2 * self._cell) + 0.5
+        return np.clip(distance, 0.0, 1.0, out=distance)
 
     def about(self, rest: Array, time: Array, noise: float) -> LowBand:
         """Return what was read, about the centres.
@@ -208,7 +225,7 @@ class LowBandReader:
         seen = np.isfinite(mass)
         typical = float(np.median(mass[seen])) if seen.any() else np.nan
         cell_noise = noise / self._binning
-        weights = self._moment_weights * (self._cell**2 * cell_noise / typical)
+        weights = self._monomials * self._disc(np.zeros(2)).ravel() * (self._cell**2 * cell_noise / typical)
         covariance = weights @ weights.T
         return LowBand(
             time=time,
@@ -222,14 +239,6 @@ class LowBandReader:
             mass=mass,
             radius=self._radius,
         )
-
-
-def _monomials(offset: Array, radius: float) -> tuple[Array, list[Array]]:
-    """Return the weight of the disc and the monomials of order 0 to 3, in radii."""
-    x1, x2 = np.meshgrid(offset / radius, offset / radius)
-    cell = (offset[1] - offset[0]) / radius
-    weight = np.clip((1.1 - np.hypot(x1, x2)) / (2 * cell) + 0.5, 0.0, 1.0)
-    return weight, [x1**a * x2**b for a, b in _POWERS]
 
 
 def _narrowed(moments: Array, spread: float) -> Array:

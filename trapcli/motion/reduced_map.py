@@ -195,19 +195,28 @@ class BandReader:
 
     def __init__(self, count: int, radius: float, band: float, pixel_size: float, binning: int = 1) -> None:
         cell = binning * pixel_size
-        self.half = int(np.ceil(TAPER * radius / cell))
+        self.half = int(np.ceil(TAPER * radius / cell)) + 1
         self._pixel_size, self._binning, self._radius = pixel_size, binning, radius
         self._offset = np.arange(-self.half, self.half + 1, dtype=np.float64) * cell
-        self._weights = np.zeros((2 * self.half + 1,) * 2)
-        weights, rows, columns = disc(self._weights.shape, np.zeros(2), radius / cell)
-        self._weights[rows, columns] = weights
         self._mu = _rings(min(band, 0.9 * np.pi / cell), radius)
         self._basis = _spanning(self._offset, float(self._mu[-1]))
         self._projections = np.full((count, self._basis.shape[1] ** 2), np.nan)
 
-    def read(self, n: int, square: Array) -> None:
-        """Read frame `n` off the square about a cell."""
-        self._projections[n] = (self._basis.T @ ((square * self._weights) @ self._basis)).ravel()
+    def read(self, n: int, square: Array, rest: Array) -> None:
+        """Read frame `n` off the square about a cell.
+
+        Parameters
+        ----------
+        rest:
+            ``(2,)`` roughly the object's centre, from that cell [length].
+        """
+        weights, rows, columns = self._disc(rest)
+        weighted = square[rows, columns] * weights
+        self._projections[n] = (self._basis[rows].T @ (weighted @ self._basis[columns])).ravel()
+
+    def _disc(self, center: Array) -> tuple[Array, slice, slice]:
+        cell = self._binning * self._pixel_size
+        return disc((2 * self.half + 1,) * 2, center / cell, self._radius / cell)
 
     def about(self, rest: Array, time: Array, noise: float) -> ReducedMap:
         """Return the reduced map about the centres (``eqRecMapReduced``).
@@ -222,7 +231,7 @@ class BandReader:
             Standard deviation of the noise of one pixel.
         """
         area = (self._binning * self._pixel_size) ** 2 / (2 * np.pi)
-        noise = area * float(np.linalg.norm(self._weights)) * noise / self._binning
+        noise = area * float(np.linalg.norm(self._disc(np.zeros(2))[0])) * noise / self._binning
         seen = np.flatnonzero(np.isfinite(rest[:, 0]))
         lines = 16
         if len(seen):
@@ -277,13 +286,17 @@ def _lay_out(attenuation: Frames, centers: Centers, pixel_size: float, band: flo
     crop = min(reach, height), min(reach, width)
     wanted = np.flatnonzero(np.isfinite(centers.center[:, 0]))
     chosen = wanted[spread(len(wanted), _SURVEY)]
-    images = np.array([np.array(image) for image in attenuation.pick(chosen)])
     finest = min(0.9 * np.pi / pixel_size, FINEST / centers.radius)
     whole = _Grid(
         crop, 1, radius, pixel_size, _rings(finest, centers.radius), _angles(int(FINEST * 1.6)), False
     )
     transform = _PolarTransform(whole)
-    survey = transform(images, centers.center[chosen], centers.level[chosen])
+    survey = np.concatenate(
+        [
+            transform(np.asarray(image)[None], centers.center[[n]], centers.level[[n]])
+            for n, image in zip(chosen, attenuation.pick(chosen), strict=True)
+        ]
+    )
     noise = transform.noise_gain * centers.noise
     if band <= 0:
         band = _band(survey, whole.mu, noise)
