@@ -80,6 +80,16 @@ def test_another_stack(result, capsys):
     assert "gives 10 frames" in capsys.readouterr().err
 
 
+def test_a_background_that_is_elsewhere(make_motion, result, capsys):
+    config = EstimateConfig(preprocess=PreprocessConfig(background="empty.tif"))
+    make_motion(provenance={"configuration": to_toml(config)}).save("b.h5")
+    assert call("b.h5", "a.tif") == 3
+    err = capsys.readouterr().err
+    assert "empty.tif" in err
+    assert "in the folder where" in err
+    assert err.count("\n") == 1
+
+
 def test_what_makes_no_sense(result, capsys):
     for arguments, code in (
         (("a.h5", "-o", "a.pdf"), 2),

@@ -17,6 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from trapcli.errors import InputError
 from trapcli.report import figures
 from trapcli.report.checks import FrameChecks, check_frames, findings
 from trapcli.report.figures import Projection
@@ -78,7 +79,13 @@ def look_at(stack: str, motion: Motion, progress: Callable[[str, int, int], None
     from trapcli.preprocess.attenuation import to_attenuation
 
     frames, config = open_again(stack, motion)
-    attenuation = to_attenuation(frames, config.preprocess, roi=config.input.roi)
+    try:
+        attenuation = to_attenuation(frames, config.preprocess, roi=config.input.roi)
+    except InputError as error:
+        if str(error).startswith((f"{config.preprocess.background}:", f"{config.preprocess.dark}:")):
+            hint = "the result was made with this file; call this in the folder where the estimate was called"
+            raise InputError(f"{error}; {hint}") from None
+        raise
     chosen = choose(motion, SHOWN)
     checks = check_frames(attenuation, chosen, progress)
     size = pixel_size(frames, motion)
