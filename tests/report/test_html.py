@@ -93,7 +93,7 @@ def test_facts(make_motion):
     )
     found = dict(facts(motion))
     duration = motion.time[-1]
-    assert float(found["Turned by"].split("°")[0]) == pytest.approx(np.degrees(5 * duration), rel=0.01)
+    assert float(found["Turned by"].split("°")[0]) == pytest.approx(np.degrees(5 * duration), rel=0.002)
     assert found["Rate of rotation"] == "5 rad/s in the median"
     assert found["Rotation axis"].startswith("36.9°")
     assert found["Typical errors (1 σ)"] == "φ 2°"

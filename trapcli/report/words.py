@@ -47,8 +47,10 @@ def facts(motion: Motion) -> list[tuple[str, str]]:
     speed = np.hypot(motion.alpha, motion.omega_3)
     known = valid & np.isfinite(speed)
     if known.any():
-        step = np.gradient(motion.time) if len(motion) > 1 else np.zeros(1)
-        turned = np.degrees(np.sum((speed * step)[known]))
+        edges = np.concatenate(
+            [motion.time[:1], motion.time[1:] / 2 + motion.time[:-1] / 2, motion.time[-1:]]
+        )
+        turned = np.degrees(np.sum((speed * np.diff(edges))[known]))
         tilt = np.degrees(np.median(np.arctan2(np.abs(motion.omega_3), motion.alpha)[known]))
         rows += [
             ("Turned by", f"{'' if known.all() else 'at least '}{turned:.3g}° in all"),
