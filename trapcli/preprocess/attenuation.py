@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from trapcli.config import PreprocessConfig
 from trapcli.errors import InputError
 from trapcli.preprocess.counts import Counts, mean_image
+from trapcli.preprocess.particle import Particle
 from trapcli.preprocess.surface import EmptyField, Light, border, fit_empty_field, median_field
 from trapcli.stack.frames import Frames
 
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 _FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
 _LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
 _COVERED = 0.01  # share of the pixels that may be free less often
+_RIVAL = 0.9  # share of the frames that show another particle, beyond which there are two
 _IMPRINT = 0.05  # darkness of a median where the particle stays, as a share of its depth, that shows it
 _FULL = 0.05  # share of free pixels below which little tells the empty field
 
@@ -41,12 +43,15 @@ class _Background:
         where I₀ isn't known.
     keep_bright:
         Whether overexposed frames are kept, because most are.
+    particle:
+        Tells the particle from what else the frames show; None where that isn't known.
     """
 
     attenuation: Callable[[NDArray[Any]], NDArray[Any]]
     note: str
     warnings: tuple[str, ...] = ()
     keep_bright: bool = False
+    particle: Particle | None = None
 
 
 def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, ...] = ()) -> Frames:
@@ -68,18 +73,19 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     Returns
     -------
     Frames
-        float32, or float64 where the input is. Pixels without light count as half a step above none. A frame
-        is all NaN where more than 1 % of it has no light, or is as bright as a pixel can be while most frames
-        are not. `StackInfo.notes` says which background was taken and why, `StackInfo.warnings` what is
-        doubtful.
+        float32, or float64 where the input is. Pixels without light count as half a step above none. What
+        stays apart from the particle is erased. A frame is all NaN where more than 1 % of it has no light, or
+        is as bright as a pixel can be while most frames are not, or where something lies before the particle
+        or a part of it is missing. `StackInfo.notes` says which background was taken and why,
+        `StackInfo.warnings` what is doubtful.
 
     Raises
     ------
     ConfigError
         For a dark level that is no level.
     InputError
-        Where background or dark frames can't be read or don't fit, or a median shows the particle itself;
-        while reading, where most frames hold no light.
+        Where background or dark frames can't be read or don't fit, a median shows the particle itself, or
+        there are two particles; while reading, where most frames hold no light.
     """
     if config.attenuation:
         return frames
@@ -93,7 +99,9 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
         spoilt = light.dark if background.keep_bright else light.dark | light.bright
         if _share(spoilt) > _FLAGGED:
             return np.full(image.shape, np.nan, dtype), _share(light.dark) > _FLAGGED
-        return _attenuation(light.values, background).astype(dtype, copy=False), False
+        attenuation = _attenuation(light.values, background).astype(dtype, copy=False)
+        alone = background.particle.alone(attenuation, light.dark) if background.particle else attenuation
+        return np.full(image.shape, np.nan, dtype) if alone is None else alone, False
 
     def read_blocks(size: int) -> Iterator[NDArray[Any]]:
         dark = 0
@@ -135,7 +143,7 @@ def _share(mask: NDArray[np.bool_]) -> float:
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
     sample, overexposed = counts.sample(frames, _FLAGGED)
-    found = _find_background(frames, source, roi, counts, sample)
+    found = _with_particle(_find_background(frames, source, roi, counts, sample), frames, sample)
     keep = overexposed > 0.5
     if not overexposed:
         return found
@@ -145,6 +153,28 @@ def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Count
         else f"about {max(0.01, overexposed):.0%} of the frames are overexposed and left out"
     )
     return replace(found, warnings=(*found.warnings, doubt), keep_bright=keep)
+
+
+def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float32]) -> _Background:
+    """Add what the particle is like, and what is to be said of what else there is."""
+    projections = [_attenuation(logs.copy(), found) for logs in sample[:: len(sample) // 32 or 1]]
+    particle = Particle.of(projections)
+    if particle is None:
+        return found
+    if np.mean([particle.has_rival(image) for image in projections]) > _RIVAL:
+        raise InputError(f"{frames.info.source}: shows two particles that stay apart; choose one with --roi")
+    alone = [particle.alone(image) for image in projections]
+    spoilt = float(np.mean([image is None for image in alone]))
+    erased = float(np.mean([a is not None and a is not b for a, b in zip(alone, projections, strict=True)]))
+    doubts = []
+    if spoilt:
+        doubts.append(
+            f"about {max(0.01, spoilt):.0%} of the frames are left out: something lies before the particle, "
+            "or a part of it has left the field"
+        )
+    if erased:
+        doubts.append(f"about {max(0.01, erased):.0%} of the frames show something else too, which is erased")
+    return replace(found, particle=particle, warnings=(*found.warnings, *doubts))
 
 
 def _find_background(
