@@ -27,7 +27,7 @@ _ROUND = 0.3  # least ratio of a speck's curvatures
 _SEEN = 4.0  # standard errors by which a candidate stands out
 _SURE = 6.0  # standard errors of the depth of a speck
 _FAINTEST = 0.005  # depth of a speck
-_STEADY = 30.0  # the same for its depth in parts of the stack
+_STEADY = 15.0  # the same for its depth in parts of the stack
 _VERY_STEADY = 100.0  # where the particle drifts too little to tell what drifts with it
 _SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
 _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
@@ -159,7 +159,7 @@ def _own(
 ) -> Bools:
     """Return the pixels that belong to no other candidate."""
     own = np.ones(x2.shape, bool)
-    here = np.hypot(x2 - place[0], x1 - place[1])
+    here = np.min([np.hypot(x2 - row, x1 - column) for row, column, *_ in (place, *near)], axis=0)
     for other in places:
         if (other != place).any() and not any(np.hypot(*(speck[:2] - other)) < _MOVES for speck in near):
             there = np.hypot(x2 - other[0], x1 - other[1])
@@ -268,7 +268,7 @@ def _stays(series: Array, here: Array, along: Array) -> bool:
     """
     shares, in_place = _explained(series, here)
     gain = _clarity(in_place - _explained(series, along)[1])
-    return _clarity(shares) > (_STEADY if gain > 2 else _VERY_STEADY if gain > -1 else np.inf)
+    return _clarity(shares) > (_STEADY if gain > 3 else _VERY_STEADY if gain > -1 else np.inf)
 
 
 def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
