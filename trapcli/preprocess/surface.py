@@ -83,7 +83,7 @@ class Light:
         for _ in range(2):
             near = np.abs(misfit) <= 3 * 1.4826 * np.median(np.abs(misfit[some])) + 1e-12
             if self.basis.shape[1] == 1:
-                coefficients = np.array([values[near].mean()])
+                coefficients = np.array([near.astype(float) @ values / np.count_nonzero(near)])
             else:
                 coefficients = np.linalg.lstsq(basis[near], values[near], rcond=None)[0]
             misfit = values - (coefficients if len(coefficients) == 1 else basis @ coefficients)
