@@ -26,7 +26,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 
 _SURVEY = 32  # frames that are looked at first
-_SURVEY_PIXELS = 8 << 20  # that the noise is measured on
+_SURVEY_PIXELS = 4 << 20  # that the noise is measured on
 _COARSE = 256  # pixels across on which the radius is measured
 _BLOCK_BYTES = 8 << 20
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the models' own errors dominate

@@ -180,9 +180,9 @@ class LowBandReader:
         taken = transfer(self.k, binning, pixel_size).prod(axis=1)
         self._factor = cell**2 / (2 * np.pi) / taken
         self._wave = np.exp(-1j * np.outer(frequency, offset))
+        self._parts = np.concatenate([self._wave.real, self._wave.imag])
         self._offset = offset
-        x1, x2 = np.meshgrid(offset / radius, offset / radius)
-        self._monomials = np.stack([(x1**a * x2**b).ravel() for a, b in _POWERS])
+        self._powers = (offset / radius) ** np.arange(4)[:, None]
         self._modes = np.full((count, len(self.k)), np.nan, complex)
         self._moments = np.full((count, len(_POWERS)), np.nan)
 
@@ -195,8 +195,11 @@ class LowBandReader:
             ``(2,)`` roughly the object's centre, from that cell [length].
         """
         inside = square[:-1, :-1]
-        self._modes[n] = ((self._wave @ inside) @ self._wave.T).ravel()[self._kept]
-        self._moments[n] = self._monomials @ (inside * self._disc(rest)).ravel()
+        # the product with the frame is the large one, and it is real
+        real, imaginary = np.split(self._parts @ inside, 2)
+        self._modes[n] = ((real + 1j * imaginary) @ self._wave.T).ravel()[self._kept]
+        powers = self._powers @ (inside * self._disc(rest)) @ self._powers.T
+        self._moments[n] = [powers[b, a] for a, b in _POWERS]
 
     def _disc(self, center: Array) -> Array:
         """Return the disc inside which moments are taken, with an edge of two cells."""
@@ -225,7 +228,8 @@ class LowBandReader:
         seen = np.isfinite(mass)
         typical = float(np.median(mass[seen])) if seen.any() else np.nan
         cell_noise = noise / self._binning
-        weights = self._monomials * self._disc(np.zeros(2)).ravel() * (self._cell**2 * cell_noise / typical)
+        monomials = np.stack([np.outer(self._powers[b], self._powers[a]).ravel() for a, b in _POWERS])
+        weights = monomials * self._disc(np.zeros(2)).ravel() * (self._cell**2 * cell_noise / typical)
         covariance = weights @ weights.T
         return LowBand(
             time=time,
