@@ -198,3 +198,10 @@ def test_a_stack_that_is_overexposed_throughout_is_used_with_a_warning(moving: n
     projections = to_attenuation(Frames.from_array(frames, StackInfo(bits=12)), PreprocessConfig())
     assert "overexposed" in projections.info.warnings[0]
     assert np.isfinite(projections.to_array()).all()
+
+
+def test_frames_that_repeat_are_named(moving: np.ndarray) -> None:
+    frames = np.random.default_rng(0).poisson(5000 * np.exp(-moving)).astype(np.uint16)
+    info = to_attenuation(Frames.from_array(frames.repeat(2, axis=0)), PreprocessConfig()).info
+    assert "repeat the one before" in info.warnings[-1]
+    assert not to_attenuation(Frames.from_array(frames), PreprocessConfig()).info.warnings

@@ -142,17 +142,19 @@ def _share(mask: NDArray[np.bool_]) -> float:
 
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
-    sample, overexposed = counts.sample(frames, _FLAGGED)
-    found = _with_particle(_find_background(frames, source, roi, counts, sample), frames, sample)
-    keep = overexposed > 0.5
-    if not overexposed:
-        return found
-    doubt = (
-        "most frames are overexposed, and what is thin can't be measured in them"
-        if keep
-        else f"about {max(0.01, overexposed):.0%} of the frames are overexposed and left out"
-    )
-    return replace(found, warnings=(*found.warnings, doubt), keep_bright=keep)
+    sample = counts.sample(frames, _FLAGGED)
+    found = _with_particle(_find_background(frames, source, roi, counts, sample.logs), frames, sample.logs)
+    keep = sample.overexposed > 0.5
+    doubts = []
+    if keep:
+        doubts.append("most frames are overexposed, and what is thin can't be measured in them")
+    elif sample.overexposed:
+        doubts.append(f"about {max(0.01, sample.overexposed):.0%} of the frames are overexposed and left out")
+    if sample.repeated:
+        doubts.append(
+            f"about {max(0.01, sample.repeated):.0%} of the frames repeat the one before; times are wrong"
+        )
+    return replace(found, warnings=(*found.warnings, *doubts), keep_bright=keep)
 
 
 def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float32]) -> _Background:

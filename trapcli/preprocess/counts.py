@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 _SAMPLED = 96  # frames that a background is made of
 _SAMPLED_BYTES = 128 << 20  # that they may take in single precision
+_PAIRS = 16  # of them that are looked at with the next one
 _FEWEST = 16
 
 
@@ -36,6 +37,26 @@ class LogLight:
     values: NDArray[Any]
     dark: NDArray[np.bool_]
     bright: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Frames spread over the stack.
+
+    Attributes
+    ----------
+    logs:
+        ``(K, H, W)`` logarithms of the light, K ≤ 112; NaN in pixels without light, and in bright ones unless
+        most frames are overexposed.
+    overexposed:
+        Share of the frames.
+    repeated:
+        Share of the frames that are the same, pixel by pixel, as the one before.
+    """
+
+    logs: NDArray[np.float32]
+    overexposed: float
+    repeated: float
 
 
 @dataclass(frozen=True)
@@ -81,27 +102,25 @@ class Counts:
         lit = np.isfinite(light) & (light > 0)
         return LogLight(np.log(np.where(lit, light, dtype.type(step))), ~lit, bright)
 
-    def sample(self, frames: Frames, most_flagged: float) -> tuple[NDArray[np.float32], float]:
-        """Return logarithms of frames spread over the stack, and how many of these are overexposed.
+    def sample(self, frames: Frames, most_flagged: float) -> Sample:
+        """Look at frames spread over the stack, some of them neighbours.
 
         Parameters
         ----------
         most_flagged:
             Share of pixels without light beyond which a frame is left out, and of bright ones beyond which
             it is overexposed and left out unless most frames are.
-
-        Returns
-        -------
-        logs:
-            ``(K, H, W)``, K ≤ 96; NaN in pixels without light, and in bright ones unless most frames are
-            overexposed.
-        overexposed:
-            Share of the frames.
         """
         count = min(_SAMPLED, max(_FEWEST, _SAMPLED_BYTES // (4 * frames.shape[1] * frames.shape[2])))
         wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
-        logs, bright = [], []
-        for image in frames.pick(wanted):
+        followed = wanted[:: max(1, len(wanted) // _PAIRS)] + 1
+        wanted = np.union1d(wanted, followed[followed < len(frames)])
+        logs, bright, repeats = [], [], []
+        before, last = np.empty(0), -2
+        for position, image in zip(wanted, frames.pick(wanted), strict=True):
+            if position == last + 1:
+                repeats.append(np.array_equal(image, before))
+            before, last = np.array(image), position
             light = self.log_light(image, np.dtype(np.float32))
             if light.dark.mean() <= most_flagged:
                 logs.append(np.where(light.dark, np.float32(np.nan), light.values))
@@ -111,9 +130,10 @@ class Counts:
                 f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"
             )
         spoilt = np.mean(bright, axis=(1, 2)) > most_flagged
-        if spoilt.mean() > 0.5:
-            return np.array(logs), float(spoilt.mean())
-        return np.where(bright, np.float32(np.nan), logs)[~spoilt], float(spoilt.mean())
+        overexposed, repeated = float(spoilt.mean()), float(np.mean(repeats or [False]))
+        if overexposed > 0.5:
+            return Sample(np.array(logs), overexposed, repeated)
+        return Sample(np.where(bright, np.float32(np.nan), logs)[~spoilt], overexposed, repeated)
 
 
 def mean_image(frames: Frames, path: str, roi: tuple[int, ...], name: str) -> Array:

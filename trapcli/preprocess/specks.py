@@ -81,6 +81,8 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
         ``(H, W)`` where no specks are needed: the image itself is the background.
     """
     shape = standing.image.shape
+    if free.all():
+        return np.zeros(shape), 0
     reach = ndimage.binary_dilation(~free, iterations=_NEAR // 2)
     whole = float(np.abs(standing.image).sum())
     specks: list[Array] = []
@@ -113,7 +115,10 @@ def _drift(frames: Stack) -> Array:
         dark = np.clip(-np.nan_to_num(image), 0, None)
         dark[dark < _CLEARLY_DARK * dark.max()] = 0
         places.append(ndimage.center_of_mass(dark) if dark.any() else (np.nan, np.nan))
-    drift = np.array(places) - np.nanmedian(places, axis=0)
+    known = np.isfinite(places).all(axis=1)
+    if not known.any():
+        return np.zeros((len(frames), 2))
+    drift = np.array(places) - np.median(np.array(places)[known], axis=0)
     return np.asarray(np.nan_to_num(drift))
 
 
