@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 _PER_RADIUS = 64
-"""Least cells across the object's radius: white noise stays white to 1 %, aliases of a ball below 1e-6."""
+"""Least cells in the object's radius: noise stays white to 1 %, and aliases of a ball are 2e-6 of it."""
 
 
 @dataclass(frozen=True)
