@@ -92,9 +92,9 @@ def estimate(
         frames = _from_array(frames)
     frames = replace(frames, info=calibrated(frames.info, config.input))
     step, time_unit, pixel, length_unit = _units(frames)
-    projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
     # the matrices are small and many: threads that share one spend most of their time waiting for each other
     with threadpool_limits(1, user_api="blas"):
+        projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
         motion = recover(
             projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
         )
