@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import time
 from pathlib import Path
@@ -25,7 +26,9 @@ TIFFS = {
     "lzw": {"compression": "lzw", "metadata": None},
     "tiles": {"tile": (16, 16), "compression": "zstd", "predictor": True},
 }
-VARIANTS = 40
+VARIANTS = int(os.environ.get("FUZZ_VARIANTS", "40"))
+SEED = os.environ.get("FUZZ_SEED", "")
+MOST_MEMORY = 600 << 10  # KiB by which no file of kilobytes may make us grow
 
 
 def write(path: Path, kind: str) -> None:
@@ -40,12 +43,19 @@ def write(path: Path, kind: str) -> None:
         write_avi(path, [frames], shape=frames.shape, codec=kind, fps=50.0, bits=bits)
 
 
+def memory() -> int:
+    """Return the most memory used so far [KiB]."""
+    resource = pytest.importorskip("resource")
+    return int(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+
+
 @pytest.mark.parametrize("kind", [*TIFFS, "hdf5", "raw", "ffv1", "mjpeg"])
 def test_only_our_own_errors_escape(tmp_path: Path, kind: str) -> None:
     path = tmp_path / "stack.avi"
     write(path, kind)
     whole = path.read_bytes()
-    chance = random.Random(kind)
+    chance = random.Random(kind + SEED)
+    before = memory()
     for variant in range(VARIANTS):
         data = bytearray(whole)
         near = chance.choice((len(data), 1200))  # half of the time among the first directories
@@ -61,3 +71,4 @@ def test_only_our_own_errors_escape(tmp_path: Path, kind: str) -> None:
             delivered, expected = str(path) in str(error), True
         assert delivered == expected
         assert time.perf_counter() - started < 5
+    assert memory() - before < MOST_MEMORY

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -564,6 +567,40 @@ def test_an_imagej_stack_beyond_four_gigabytes_in_bounded_memory(tmp_path: Path)
     np.testing.assert_array_equal(seen, np.arange(shape[0]))
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     assert grown < 200, f"{grown} MiB"
+
+
+@pytest.mark.slow
+def test_forty_gigabytes_in_bounded_memory(tmp_path: Path) -> None:
+    """An ImageJ stack, sparse on disk, read as a whole by a process of its own."""
+    pytest.importorskip("resource")
+    path = tmp_path / "stack.tif"
+    count, side = 20_000, 1024
+    with tifffile.TiffWriter(path, imagej=True) as writer:
+        writer.write(
+            None, shape=(count, side, side), dtype="uint16", truncate=True, photometric="minisblack",
+            metadata={"axes": "TYX"},
+        )  # fmt: skip
+    with tifffile.TiffFile(path) as tiff:
+        start = tiff.pages.first.dataoffsets[0]
+    with path.open("r+b") as file:
+        file.truncate(start + 2 * count * side**2)
+        file.seek(-2, os.SEEK_END)
+        file.write(struct.pack("<H", 7))
+    assert path.stat().st_size > 40e9
+    program = (
+        "import resource, sys\n"
+        "from trapcli.stack import open_stack\n"
+        "stack = open_stack(sys.argv[1])\n"
+        "count = 0\n"
+        "for block in stack.blocks():\n"
+        "    count += len(block)\n"
+        "print(stack.shape[0], count, block[-1, -1, -1])\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True, check=True)
+    counts, memory = done.stdout.splitlines()
+    assert counts == f"{count} {count} 7"
+    assert int(memory) / 1024 < 600
 
 
 @pytest.mark.slow
