@@ -11,7 +11,7 @@ PIP    := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-p
 # the tests' matrices are small, and several processes run at once
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test slow lint docs setup bench clean
+.PHONY: demo test slow fuzz lint docs setup bench clean
 
 setup: $(STAMP)
 $(STAMP): pyproject.toml
@@ -43,6 +43,14 @@ test: $(TOOLS)
 slow: $(TOOLS)
 	$(BIN)/python -m pytest -m slow
 
+# damaged files until VARIANTS of each kind are tried; a failure is repeated with the SEED that is printed
+VARIANTS ?= 2000
+SEED ?= $(shell date +%s)
+fuzz: $(TOOLS)
+	@echo "SEED=$(SEED)"
+	FUZZ_SEED=$(SEED) FUZZ_VARIANTS=$(VARIANTS) $(BIN)/python -m pytest tests/faults/test_byte_flips.py tests/faults/test_configuration.py
+	$(BIN)/python -m pytest tests/result/test_result_file.py -m slow -k flipped
+
 lint: $(TOOLS)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -52,9 +60,10 @@ lint: $(TOOLS)
 docs: $(TOOLS)
 	$(BIN)/mkdocs build --strict --quiet
 
-# the table of docs/benchmarks-paper.md
+# docs/benchmarks-paper.md, and docs/benchmarks-speed.md at a size that takes a few minutes
 bench: $(STAMP)
 	$(BIN)/python benchmarks/paper_table.py
+	$(BIN)/python benchmarks/speed/run.py --quick
 
 clean:
 	rm -rf demo site $(VENV) build *.egg-info
