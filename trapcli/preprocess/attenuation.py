@@ -159,7 +159,8 @@ def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Count
 
 def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float32]) -> _Background:
     """Add what the particle is like, and what is to be said of what else there is."""
-    projections = [_attenuation(logs.copy(), found) for logs in sample[:: len(sample) // 32 or 1]]
+    # the logarithms have served their purpose, and are large
+    projections = [_attenuation(logs, found) for logs in sample[:: len(sample) // 32 or 1]]
     particle = Particle.of(projections)
     if particle is None:
         return found

@@ -115,7 +115,9 @@ class Counts:
         wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
         followed = wanted[:: max(1, len(wanted) // _PAIRS)] + 1
         wanted = np.union1d(wanted, followed[followed < len(frames)])
-        logs, bright, repeats = [], [], []
+        logs = np.empty((len(wanted), *frames.shape[1:]), np.float32)
+        bright: list[NDArray[np.bool_]] = []
+        repeats: list[bool] = []
         before, last = np.empty(0), -2
         for position, image in zip(wanted, frames.pick(wanted), strict=True):
             if position == last + 1:
@@ -123,17 +125,21 @@ class Counts:
             before, last = np.array(image), position
             light = self.log_light(image, np.dtype(np.float32))
             if light.dark.mean() <= most_flagged:
-                logs.append(np.where(light.dark, np.float32(np.nan), light.values))
+                light.values[light.dark] = np.nan
+                logs[len(bright)] = light.values
                 bright.append(light.bright)
-        if not logs:
+        if not bright:
             raise InputError(
                 f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"
             )
         spoilt = np.mean(bright, axis=(1, 2)) > most_flagged
         overexposed, repeated = float(spoilt.mean()), float(np.mean(repeats or [False]))
-        if overexposed > 0.5:
-            return Sample(np.array(logs), overexposed, repeated)
-        return Sample(np.where(bright, np.float32(np.nan), logs)[~spoilt], overexposed, repeated)
+        logs = logs[: len(bright)]
+        if overexposed <= 0.5:
+            for image, mask in zip(logs, bright, strict=True):
+                image[mask] = np.nan
+            logs = logs[~spoilt] if spoilt.any() else logs
+        return Sample(logs, overexposed, repeated)
 
 
 def mean_image(frames: Frames, path: str, roi: tuple[int, ...], name: str) -> Array:
