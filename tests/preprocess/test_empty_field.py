@@ -56,7 +56,7 @@ def test_smooth_light_is_carried_on_under_the_particle() -> None:
 def test_specks_are_found_under_the_particle_and_beside_it(place: tuple[int, int]) -> None:
     field = uneven() + speck(*place)
     found = fit_empty_field(stack(field))
-    assert found.specks == (np.hypot(*place) < 30)  # beside the particle they are measured
+    assert found.specks == (np.hypot(*place) < 30)  # those beside it don't count
     error = deviation(found.log_light, field)
     around = np.hypot(ROWS - place[0], COLUMNS - place[1]) < 9
     assert abs(error[around].sum()) < 0.1 * abs(speck(*place).sum())

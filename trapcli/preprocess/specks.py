@@ -9,7 +9,8 @@ explains the mean, given this covariance, is fitted, then the next. What drifts 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
     shape = standing.image.shape
     if free.all():
         return np.zeros(shape), 0
-    reach = ndimage.binary_dilation(~free, iterations=_NEAR // 2)
+    reach = ndimage.binary_dilation(~free, iterations=_NEAR + _TOGETHER)
     whole = float(np.abs(standing.image).sum())
     specks: list[Array] = []
     refused = np.zeros(shape, bool)
@@ -105,7 +106,13 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
             found = True
         if not found:
             break
-    return render(specks, shape), len(specks)
+    covered = [speck for speck in specks if not free[_pixel(speck, shape)]]
+    return render(specks, shape), len(covered)
+
+
+def _pixel(speck: Array, shape: tuple[int, ...]) -> tuple[int, int]:
+    row, column = np.clip(np.rint(speck[:2]).astype(int), 0, np.array(shape) - 1)
+    return int(row), int(column)
 
 
 def _drift(frames: Stack) -> Array:
@@ -210,55 +217,82 @@ def _is_compact(image: Array) -> Bools:
     return np.asarray(np.abs(mean) - deviation > _ROUND * (np.abs(mean) + deviation))
 
 
+@dataclass(frozen=True)
+class _Window:
+    """Some pixels of the frames, whitened."""
+
+    rows: slice
+    columns: slice
+    keep: Bools
+    root: Array
+
+    @cached_property
+    def places(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        x2, x1 = np.mgrid[self.rows, self.columns]
+        return x2[self.keep], x1[self.keep]
+
+    def white(self, pixels: NDArray[Any]) -> Array:
+        return np.asarray(linalg.solve_triangular(self.root, pixels, lower=True, check_finite=False))
+
+    def of(self, images: NDArray[Any]) -> Array:
+        """Return ``(P,)`` whitened pixels of an image, or ``(P, K)`` of K."""
+        return self.white(images[..., self.rows, self.columns][..., self.keep].T)
+
+    def profiles(self, specks: Array) -> Array:
+        """Return ``(P,)`` whitened pixels of ``(S, 4)`` specks."""
+        total = np.zeros(np.count_nonzero(self.keep))
+        for speck in specks:
+            total += _profile(*self.places, *speck)
+        return self.white(total)
+
+    def fit(self, start: Array, target: Array) -> optimize.OptimizeResult:
+        """Fit specks, ``(S, 4)`` at the start, to whitened pixels."""
+        lower, upper = start - _MOVES, start + _MOVES
+        lower[:, 2:], upper[:, 2:] = (_LEAST_SIZE, -_DEEPEST), (_MOST_SIZE, _DEEPEST)
+
+        def misfit(parameters: Array) -> Array:
+            return target - self.profiles(parameters.reshape(-1, 4))
+
+        def slopes(parameters: Array) -> Array:
+            columns = [_slopes(*self.places, *speck) for speck in parameters.reshape(-1, 4)]
+            return -self.white(np.concatenate(columns, axis=1))
+
+        limits = lower.ravel(), upper.ravel()
+        inside = np.clip(start.ravel(), *limits)
+        return optimize.least_squares(misfit, inside, slopes, bounds=limits, xtol=1e-4, ftol=1e-5)
+
+
 def _fit(
     standing: Standing, place: Array, specks: list[Array], near: list[int], places: Array
 ) -> list[Array] | None:
     """Return a speck at `place` and those `near` it, fitted together; None where there is none."""
-    rows, columns = _window(place, standing.image.shape, _NEAR)
-    others = render([speck for k, speck in enumerate(specks) if k not in near], standing.image.shape)
+    shape = standing.image.shape
+    rows, columns = _window(place, shape, _NEAR)
+    known = [specks[k] for k in near]
     x2, x1 = np.mgrid[rows, columns]
-    keep = _own(x2, x1, place, places, [specks[k] for k in near])
-    x2, x1 = x2[keep], x1[keep]
-    root = _root_of_covariance(standing, rows, columns, keep)
-
-    def white(values: Array) -> Array:
-        return np.asarray(linalg.solve_triangular(root, values, lower=True, check_finite=False))
-
-    target = white((standing.image - others)[rows, columns][keep])
-
-    def misfit(parameters: Array) -> Array:
-        model = sum(_profile(x2, x1, *speck) for speck in parameters.reshape(-1, 4))
-        return target - white(np.asarray(model))
-
-    def slopes(parameters: Array) -> Array:
-        return -white(
-            np.concatenate([_slopes(x2, x1, *speck) for speck in parameters.reshape(-1, 4)], axis=1)
-        )
-
+    keep = _own(x2, x1, place, places, known)
+    window = _Window(rows, columns, keep, _root_of_covariance(standing, rows, columns, keep))
+    others = render([speck for k, speck in enumerate(specks) if k not in near], shape)
     sign = np.sign(_sharp(standing.image - others)[tuple(place.astype(int))])
-    best = None
-    for size in _SIZES:
-        start = np.array([[*place, size, -0.1 * sign], *(specks[k] for k in near)])
-        lower, upper = start - _MOVES, start + _MOVES
-        lower[:, 2:], upper[:, 2:] = (_LEAST_SIZE, -_DEEPEST), (_MOST_SIZE, _DEEPEST)
-        found = optimize.least_squares(
-            misfit, start.ravel(), slopes, bounds=(lower.ravel(), upper.ravel()), xtol=1e-4, ftol=1e-5
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-    assert best is not None
-    fitted = list(best.x.reshape(-1, 4))
-    scatter = max(1.0, np.sqrt(2 * best.cost / len(target)))
-    error = np.sqrt(np.linalg.pinv(best.jac.T @ best.jac)[3, 3]) * scatter
+    target = window.of(standing.image - others)
+    starts = [np.array([[*place, size, -0.1 * sign], *known]) for size in _SIZES]
+    found = min((window.fit(start, target) for start in starts), key=lambda result: float(result.cost))
+    series = window.of(np.nan_to_num(standing.frames) - others)
+    # frames in which the particle is smooth here tell more
+    left = series - window.profiles(found.x.reshape(-1, 4))[:, None]
+    weights = 1 / np.maximum(np.mean(left**2, axis=0), 1e-300)
+    found = window.fit(found.x.reshape(-1, 4), series @ weights / weights.sum())
+    fitted = list(found.x.reshape(-1, 4))
+    scatter = max(1.0, np.sqrt(2 * found.cost / keep.sum()))
+    error = np.sqrt(np.linalg.pinv(found.jac.T @ found.jac)[3, 3]) * scatter
     size, depth = fitted[0][2:]
     moved = np.abs(fitted[0][:2] - place).max() > 0.99 * _MOVES
     if moved or abs(depth) < max(_FAINTEST, _SURE * error) or size > 0.95 * _MOST_SIZE:
         return None
-    known = others + render(fitted[1:], standing.image.shape)
-    series = white((np.nan_to_num(standing.frames) - known)[:, rows, columns][:, keep].T)
-    here = white(_profile(x2, x1, *fitted[0]))[:, None]
-    along = [_profile(x2, x1, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
-    return fitted if _stays(series, here, white(np.array(along).T)) else None
+    series = series - window.profiles(found.x.reshape(-1, 4)[1:])[:, None]
+    along = [_profile(*window.places, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
+    here = window.profiles(found.x.reshape(-1, 4)[:1])[:, None]
+    return fitted if _stays(series, here, window.white(np.array(along).T)) else None
 
 
 def _stays(series: Array, here: Array, along: Array) -> bool:

@@ -36,6 +36,7 @@ _DIRECT = (
 _SIGNIFICANT = 4.0  # standard deviations
 _QUIET = 0.95  # share of frames in which a pixel that tells the brightness lies outside of the particle
 _LEAST_QUIET = 0.02  # share of such pixels below which the border has to do
+_FOOTPRINT = 1e-3  # depth down to which a speck counts
 _TILTED = 0.003  # least tilt of the light, from the middle to the edge of a frame, that is taken out
 _TYPICAL_PIXELS = 4096  # that tell what misfit is common among those
 _MOST_PIXELS = 65536  # of a surface, and of a frame's brightness: enough for both
@@ -285,7 +286,9 @@ def _pattern(residual: Stack, direct: Array, count: Array, noise: float, look: b
     if not look:
         return pattern, 0
     specks, number = find_specks(Standing.of(residual, noise), measured)
-    return np.where(measured, pattern, specks), number
+    # a pixel that looks free when the particle happens to make up for a speck deceives
+    fitted = (np.abs(specks) > _FOOTPRINT) & (count < _QUIET * len(residual))
+    return np.where(measured & ~fitted, pattern, specks), number
 
 
 def _is_tilted(residual: Stack, quiet: Bools, noise: float) -> bool:
