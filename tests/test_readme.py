@@ -208,6 +208,21 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert target.startswith("https://") or (page.parent / target).exists(), target
 
 
+def test_figures_in_the_readme_are_those_of_the_benchmarks() -> None:
+    text = README.read_text(encoding="utf-8")
+    shown = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(shown) >= 8
+    assert current_rows(text) == text
+
+
+def current_rows(text: str) -> str:
+    """Return a page with the rows of its tables as the pages of benchmarks have them now."""
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("benchmarks*.md")))
+    rows = {line.split("|")[1]: line for line in reversed(pages.splitlines()) if line.startswith("| ")}
+    lines = (rows[line.split("|")[1]] if line.startswith("| ") else line for line in text.split("\n"))
+    return "\n".join(lines)
+
+
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="MkDocs isn't installed")
     built = shell(f"mkdocs build --strict --quiet --site-dir {tmp_path / 'site'}", ROOT)
@@ -250,7 +265,8 @@ def test_sample_data_are_small_and_can_be_made_again(tmp_path: Path) -> None:
 
 
 def update() -> None:
-    """Write the outputs of README and tutorial, the examples in docs/cluster.md, and docs/cli.md anew."""
+    """Write the outputs of README and tutorial, the README's tables, docs/cluster.md and docs/cli.md anew."""
+    README.write_text(current_rows(README.read_text(encoding="utf-8")), encoding="utf-8")
     CLI.write_text(cli_page(), encoding="utf-8")
     text = CLUSTER.read_text(encoding="utf-8")
     for language, name in (("bash", "slurm-array.sh"), ("python", "Snakefile")):
