@@ -145,10 +145,12 @@ def _look(image: Array, level: float) -> _Look | None:
     labels, count = ndimage.label(inside)
     if not count:
         return None
-    masses = ndimage.sum_labels(image, labels, np.arange(1, count + 1))
-    row, column = ndimage.center_of_mass(np.clip(image, 0, None), labels, 1 + int(np.argmax(masses)))
+    masses = np.bincount(labels.ravel(), image.ravel())
+    largest = np.where(labels == 1 + np.argmax(masses[1:]), np.clip(image, 0, None), 0)
     rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    return _Look(image, inside, labels, np.hypot(rows - row, columns - column))
+    row = largest.sum(axis=1) @ rows[:, 0] / largest.sum()
+    column = largest.sum(axis=0) @ columns[0] / largest.sum()
+    return _Look(image, inside, labels, np.sqrt((rows - row) ** 2 + (columns - column) ** 2))
 
 
 def _coarse(image: NDArray[Any], binning: int) -> Array:
