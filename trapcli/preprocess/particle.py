@@ -23,6 +23,7 @@ _COARSE = 256  # pixels across on which is looked
 _PATCH = 5  # edge of the mean in which something must stand out [coarse pixels]
 _CLEAR = 6.0  # standard deviations of such a mean
 _DEEP = 0.05  # or of the frames' highest attenuation
+_FAINT = 2.0  # peak of something, in units of that level, below which it is nothing
 _USUAL = 0.2  # share of the frames in which the particle reaches so far
 _MARGIN = 3  # width of the doubtful ring around the particle [coarse pixels]
 _TOUCHING = 0.02  # attenuation beyond that, as a share of all, that belongs to something else
@@ -141,16 +142,18 @@ class Particle:
 
 def _look(image: Array, level: float) -> _Look | None:
     """Return what stands out of a coarse image; None where nothing does."""
-    inside = _smooth(image) > level
-    labels, count = ndimage.label(inside)
+    smooth = _smooth(image)
+    labels, count = ndimage.label(smooth > level)
     if not count:
         return None
-    masses = np.bincount(labels.ravel(), image.ravel())
-    largest = np.where(labels == 1 + np.argmax(masses[1:]), np.clip(image, 0, None), 0)
+    every = np.arange(1, count + 1)
+    largest = int(every[np.argmax(ndimage.sum_labels(image, labels, every))])
+    # beside the particle, what is faint is the noise before dust
+    faint = ndimage.maximum(smooth, labels, every) < _FAINT * level
+    labels[np.isin(labels, every[faint & (every != largest)])] = 0
+    row, column = ndimage.center_of_mass(np.clip(image, 0, None), labels, largest)
     rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    row = largest.sum(axis=1) @ rows[:, 0] / largest.sum()
-    column = largest.sum(axis=0) @ columns[0] / largest.sum()
-    return _Look(image, inside, labels, np.sqrt((rows - row) ** 2 + (columns - column) ** 2))
+    return _Look(image, labels > 0, labels, np.hypot(rows - row, columns - column))
 
 
 def _coarse(image: NDArray[Any], binning: int) -> Array:
