@@ -20,6 +20,7 @@ BAND, FINE_BAND = 12 / RADIUS, 16 / RADIUS
 NOISE = 0.002  # of a mode, as a share of the mass
 FRAMES, KNOTS = 60, 5
 SIGMA = np.diag([1.0, 1.0, -1.0])
+TUMBLING = Tumbling.random(np.random.default_rng(4), total_angle=240.0, duration=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +30,8 @@ def thing() -> Blobs:
 
 @pytest.fixture(scope="module")
 def path() -> Path:
-    tumbling = Tumbling.random(np.random.default_rng(4), total_angle=240.0, duration=1.0)
     time = np.linspace(0, 1, FRAMES)
-    return Path(time, tumbling.rotations(time), tumbling.omega(time))
+    return Path(time, TUMBLING.rotations(time), TUMBLING.omega(time))
 
 
 def frequencies(band: float) -> Array:
@@ -73,7 +73,7 @@ def test_misfit_per_degree_of_freedom_is_1_at_the_truth(path: Path, seed: int) -
     thing = Blobs.random(np.random.default_rng(seed), radius=RADIUS)
     spline = Spline(0.0, 1.0, KNOTS)
     model = ObjectModel(low_band(thing, path, seed, band=FINE_BAND), FINE_BAND)
-    fit = model.fit(path, path.time, spline, steps=0)
+    fit = model.fit(path, path.time, spline, smooth=False, steps=0)
     # nothing was fitted but the object
     degrees = model.assess(fit).degrees + 3 * spline.size - 3 + 2 * FRAMES
     assert fit.cost / degrees == pytest.approx(1, abs=0.05)
@@ -91,7 +91,7 @@ def test_the_gradient_is_half_the_slope_downhill(thing: Blobs, path: Path) -> No
     model = ObjectModel(low, BAND, weights=np.linspace(0.5, 1, FRAMES))
     rng = np.random.default_rng(0)
     R, h = turned(path.R, rng.normal(scale=0.05, size=(FRAMES, 3))), 1e-5
-    _, state = model._state(R, low.modes)
+    state = model._state(model._views(R), low.modes)
     gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
     assert model.cost(R, low.modes) == pytest.approx(state.cost)
     for _ in range(2):
@@ -108,8 +108,9 @@ def test_the_hessian_has_object_and_shifts_eliminated(thing: Blobs, path: Path) 
     path = Path(path.time[few], path.R[few], path.omega[few])
     low, values = low_band(thing, path, 1, band=band), Spline(0.0, 1.0, 1).values(path.time)
     model = ObjectModel(low, band)
-    normal, state = model._state(path.R, low.modes)
-    found = model._hessian(path.R, normal, state, values)
+    views = model._views(path.R)
+    state = model._state(views, low.modes)
+    found = model._hessian(views, state, values)
 
     blob = model._blob * np.sqrt(np.where((low.k == 0).all(axis=1), 1.0, 2.0) / low.variance)
     waves = np.exp(-1j * np.swapaxes(model.position @ (path.R[:, :, :2] @ low.k.T), 1, 2))
@@ -145,9 +146,16 @@ def test_a_turn_of_the_object_changes_hardly_anything(thing: Blobs, path: Path) 
     assert np.ptp(costs) < 0.02 * np.mean(costs)
 
 
-def wrong_by(path: Path, off: float, seed: int) -> tuple[Path, Spline]:
-    spline = Spline(0.0, 1.0, KNOTS)
-    return path.bent(spline, off * np.random.default_rng(seed).normal(size=(spline.size, 3))), spline
+def on_grid(path: Path, spline: Spline) -> Path:
+    """Return the path that is true, with the spline's grid before the groups."""
+    time = np.concatenate([spline.grid, path.time])
+    return Path(time, TUMBLING.rotations(time), TUMBLING.omega(time))
+
+
+def wrong_by(path: Path, off: float, seed: int, knots: int = KNOTS) -> tuple[Path, Spline]:
+    rough, spline = Spline(0.0, 1.0, KNOTS), Spline(0.0, 1.0, knots)
+    bend = off * np.random.default_rng(seed).normal(size=(rough.size, 3))
+    return on_grid(path, spline).bent(rough, bend), spline
 
 
 def test_a_fit_comes_back_to_the_truth(thing: Blobs, path: Path) -> None:
@@ -155,8 +163,8 @@ def test_a_fit_comes_back_to_the_truth(thing: Blobs, path: Path) -> None:
     model = ObjectModel(low, BAND)
     wrong, spline = wrong_by(path, 0.05, 0)
     fit = model.fit(wrong, path.time, spline)
-    assert np.rad2deg(align(wrong.R, path.R)[0].mean()) > 2
-    assert np.rad2deg(align(fit.path.R, path.R)[0].mean()) < 0.3
+    assert np.rad2deg(align(wrong.R[-FRAMES:], path.R)[0].mean()) > 2
+    assert np.rad2deg(align(fit.path.R[-FRAMES:], path.R)[0].mean()) < 0.3
     assessment = model.assess(fit)
     misfit = fit.cost / assessment.degrees
     assert misfit == pytest.approx(1, abs=0.1)
@@ -170,9 +178,9 @@ def test_a_fit_comes_back_to_the_truth(thing: Blobs, path: Path) -> None:
 def test_the_shifts_of_the_centres_are_found(thing: Blobs, path: Path) -> None:
     off = np.random.default_rng(3).normal(scale=0.1, size=(FRAMES, 2))
     model = ObjectModel(low_band(thing, path, 1).shifted(off), BAND)
-    fit = model.fit(path, path.time, Spline(0.0, 1.0, KNOTS))
+    fit = model.fit(*_started(path, 0))
     # where the object lies on the lattice is free
-    design = np.swapaxes(fit.path.R, 1, 2)[:, :2].reshape(-1, 3)
+    design = np.swapaxes(fit.path.R[-FRAMES:], 1, 2)[:, :2].reshape(-1, 3)
     error = (fit.shift + off).ravel()
     error -= design @ np.linalg.lstsq(design, error, rcond=None)[0]
     ratio = error / model.assess(fit).shift_errors.ravel()
@@ -186,26 +194,37 @@ def test_outlying_frames_with_small_weights_do_no_harm(thing: Blobs, path: Path)
     weights[20] = 1e-6
     wrong, spline = wrong_by(path, 0.02, 1)
     fit = ObjectModel(low, BAND, weights=weights).fit(wrong, path.time, spline)
-    assert np.rad2deg(align(fit.path.R, path.R)[0].mean()) < 0.3
+    assert np.rad2deg(align(fit.path.R[-FRAMES:], path.R)[0].mean()) < 0.3
 
 
 @pytest.mark.slow
-def test_errors_of_the_angles_come_true(thing: Blobs, path: Path) -> None:
+def test_errors_of_the_angles_come_true() -> None:
+    """Over objects, motions and noise: what smoothing takes away is within the errors as well."""
     ratios = []
-    for seed in range(20):
-        model = ObjectModel(low_band(thing, path, seed), BAND)
-        fit = model.fit(*_started(path, seed))
+    time = np.linspace(0, 1, FRAMES)
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        thing = Blobs.random(rng, radius=RADIUS)
+        motion = Tumbling.random(rng, total_angle=240.0, duration=1.0)
+        spline, rough = Spline(0.0, 1.0, 30), Spline(0.0, 1.0, KNOTS)
+        times = np.concatenate([spline.grid, time])
+        path = Path(times, motion.rotations(times), motion.omega(times))
+        truth = path.R[-FRAMES:]
+        seen = Path(time, truth, path.omega[-FRAMES:])
+        model = ObjectModel(low_band(thing, seen, seed, band=FINE_BAND), FINE_BAND)
+        wrong = path.bent(rough, 0.02 * rng.normal(size=(rough.size, 3)))
+        fit = model.fit(wrong, time, spline)
         covariance = model.assess(fit).covariance
-        values = fit.spline.values(path.time)
-        R, truth = (rotations[0].T @ rotations for rotations in (fit.path.R, path.R))
-        variances = np.diagonal(_rotation_covariance(R, values, covariance), axis1=1, axis2=2)
+        R, truth = (rotations[0].T @ rotations for rotations in (fit.path.R[-FRAMES:], truth))
+        variances = np.diagonal(_rotation_covariance(R, spline.values(time), covariance), axis1=1, axis2=2)
         vectors = Rotation.from_matrix(np.swapaxes(R, 1, 2) @ truth).as_rotvec()
         ratios.append((vectors[5:] / np.sqrt(variances[5:])).ravel())
     ratio = np.abs(np.concatenate(ratios))
+    # the errors of one motion hang together: twelve motions tell these shares to 0.03 and 0.01
     assert 0.6 < np.mean(ratio < 1) < 0.76
-    assert 0.93 < np.mean(ratio < 2) < 0.975
+    assert 0.93 < np.mean(ratio < 2) < 0.985
 
 
 def _started(path: Path, seed: int) -> tuple[Path, Array, Spline]:
-    wrong, spline = wrong_by(path, 0.02, seed)
+    wrong, spline = wrong_by(path, 0.02, seed, knots=20)
     return wrong, path.time, spline

@@ -219,7 +219,7 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
             # the border stands in for the empty field until the radius is known
             image = image - np.median(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]))
             found[n] = _find(image, noise, radius, found[n])
-            _add_profile(pixels, power, image, noise, found[n])
+            _add_profile(pixels, power, image, found[n])
         pixels, power = pixels[pixels > 0], power[pixels > 0]
         if not len(pixels):
             return farthest
@@ -307,17 +307,18 @@ def _centroid(
     return center, mass
 
 
-def _add_profile(
-    pixels: Array, power: Array, image: NDArray[Any], noise: float, found: _Found | None
-) -> None:
-    """Add the pixels, and their power beyond the noise, in rings about the centre."""
+def _add_profile(pixels: Array, power: Array, image: NDArray[Any], found: _Found | None) -> None:
+    """Add the pixels, and the object's power, in rings about the centre."""
     if found is None:
         return
     x1, x2 = _axes(image.shape)
     r2 = (x1 - found.center[0]) ** 2 + ((x2 - found.center[1]) ** 2)[:, None]
     ring = np.minimum(np.sqrt(r2) / _RING, len(pixels) - 1).astype(int).ravel()
     pixels += np.bincount(ring, minlength=len(pixels))
-    power += np.bincount(ring, ((image - found.level) ** 2 - noise**2).ravel(), len(pixels))
+    # products of neighbours: white noise averages out, however strong it is in this part of the frame
+    cleared = image - found.level
+    product = cleared * (np.roll(cleared, 1, axis=0) + np.roll(cleared, 1, axis=1)) / 2
+    power += np.bincount(ring, product.ravel(), len(pixels))
 
 
 def _level(image: NDArray[Any], noise: float, radius: float, center: Array) -> float:

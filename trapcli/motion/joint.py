@@ -48,7 +48,9 @@ _ATTEMPTS = (
 )  # first window [groups] and where it lies
 _FITS = 1.5  # misfit per degree of freedom of lines and moments at which no other window is tried
 _RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refined as well
-_KNOT_ANGLES = np.deg2rad((24.0, 12.0, 6.0))  # rotation per interval of the spline, coarse to fine
+_COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
+_FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
+_FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _CERTIFIED = 1.08  # misfit per degree of freedom that pixel noise explains
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
@@ -221,25 +223,19 @@ def _refine(
     _, low = _grouped(stack, used, size)
     time = stack.low.time
     turned = float(np.linalg.norm(hypothesis.path.mean_omega(), axis=1).mean() * np.ptp(low.time))
-    intervals = [knots] if knots else [max(4, round(turned / angle)) for angle in _KNOT_ANGLES]
+    rough, fine = (
+        Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3))
+        for least, angle in zip(_FEWEST_KNOTS, (_COARSE_KNOTS, _FINE_KNOTS), strict=True)
+    )
+    if knots:
+        rough = fine = Spline(time[0], time[-1], knots)
+    path = _resampled(hypothesis.path, rough, np.concatenate([time, fine.grid, low.time]))
     coarse = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
-    best: Fit | None = None
-    for count in intervals:
-        if best is not None and 3 * count > len(low.time):
-            break
-        spline = Spline(time[0], time[-1], count)
-        if best is None:
-            path = _resampled(hypothesis.path, spline, np.concatenate([time, low.time]))
-        else:
-            path = best.path
-        fit = coarse.fit(path, low.time, spline)
-        # Akaike: a parameter must lower the misfit by 2
-        if best is not None and best.cost - fit.cost < 2 * 3 * (fit.spline.size - best.spline.size):
-            break
-        best = fit
-    assert best is not None
+    path = coarse.fit(path, low.time, rough, smooth=False).path
+    if not knots:
+        path = coarse.fit(path, low.time, fine).path
     model = ObjectModel(low, band)
-    fit = model.fit(best.path, low.time, best.spline)
+    fit = model.fit(path, low.time, fine, smooth=not knots)
     assessment = model.assess(fit)
     if fit.cost / assessment.degrees > _CERTIFIED:
         return _with_model_error(fit, assessment, band)
@@ -256,7 +252,7 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
     """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
     excess = np.maximum(assessment.mode_misfit, 1.0)
     model = ObjectModel(fit.low, band, variance=fit.low.variance * excess)
-    again = model.fit(fit.path, fit.low.time, fit.spline)
+    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
     return again, replace(honest, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline
+from trapcli.motion.roughness import Roughness
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -26,14 +27,15 @@ ComplexArray = NDArray[np.complex128]
 SPACING = 0.7
 """Lattice spacing in units of π / band; coarser than 0.75 the lattice can't hold the band."""
 
-_WIDTH = 0.8  # standard deviation of a blob in lattice spacings
 _MARGIN = 0.3  # lattice beyond the object's radius, in spacings
+_WIDTH = 0.4  # standard deviation of a blob in lattice spacings
 _PRECISION = 1e-13  # of the transforms: the normal matrix spans ten orders of magnitude
+_ROUGH_PRECISION = 1e-7  # where a step is only looked for
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
-_STEPS = 6
+_STEPS = 10
 _SHIFT_STEPS = 12  # of conjugate gradients
 _SHIFT_TOLERANCE = 1e-3  # gain of such a step, in units of the first one's, that ends them
-_CONVERGED = 0.5  # gain in misfit, against an expected change of 1, that ends the search
+_CONVERGED = 0.1  # gain in misfit, in units of a noise's, that ends the search
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Fit:
     Attributes
     ----------
     path:
-        R and ω at the times that were asked for, followed by the G group times.
+        R and ω at the times that were asked for, followed by the spline's grid and the G group times.
     low:
         The data, centred as the model wants them.
     shift:
@@ -52,6 +54,8 @@ class Fit:
         What bent the path.
     cost:
         Misfit to the data.
+    roughness:
+        What counted beside the misfit; None where the spline alone smoothes.
     """
 
     path: Path
@@ -59,6 +63,7 @@ class Fit:
     shift: Array
     spline: Spline
     cost: float
+    roughness: Roughness | None
 
 
 @dataclass(frozen=True)
@@ -139,54 +144,78 @@ class ObjectModel:
 
     def cost(self, R: Array, modes: ComplexArray) -> float:
         """Return the misfit of ``(G, 3, 3)`` rotations to ``(G, K)`` modes, the object eliminated."""
-        normal, right = self._normal(R, modes)
-        factor = scipy.linalg.cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
-        half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
-        return self._square(modes) - float(half @ half)
+        return self._cost(self._views(R), modes)
 
-    def fit(self, path: Path, times: Array, spline: Spline, *, steps: int = _STEPS) -> Fit:
+    def fit(
+        self, path: Path, times: Array, spline: Spline, *, smooth: bool = True, steps: int = _STEPS
+    ) -> Fit:
         """Bend `path` to the least misfit (Gauss–Newton on the projected misfit).
 
         Parameters
         ----------
         path:
-            R and ω at the times asked for, followed by the G group times.
+            R and ω at the times asked for, followed by the spline's grid and the G group times.
         times:
             The G group times.
         spline:
             What bends the path.
+        smooth:
+            Whether roughness of ω counts, with a weight found from the data.
         """
         groups = len(times)
         values = spline.values(times)
+        roughness = Roughness(spline) if smooth else None
         low, shift = self.low, np.zeros((groups, 2))
         hessian: Array | None = None
         old = np.inf
+        views = self._views(path.R[-groups:])
         for _ in range(steps):
-            moved = self._shift_step(path.R[-groups:], self._state(path.R[-groups:], low.modes)[1])
+            moved = self._shift_step(views, self._state(views, low.modes))
             shift, low = shift + moved, low.shifted(moved)
-            normal, state = self._state(path.R[-groups:], low.modes)
+            state = self._state(views, low.modes)
+            gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
+            downhill = (values.T @ gradient).ravel()
+            fresh = hessian is None
             if hessian is None:
-                hessian = self._hessian(path.R[-groups:], normal, state, values)
-            gain, path = self._search(path, low, spline, hessian, state, values)
-            if gain < _CONVERGED:
+                curvature = self._hessian(views, state, values)
+                hessian = _pinned(curvature, path.R[-groups:], values)
+                if roughness is not None:
+                    # far from the motion the misfit is large, and must not call for wiggles
+                    excess = max(1.0, state.cost / self._degrees(groups))
+                    roughness = roughness.weighed(hessian / excess, downhill / excess, path, groups)
+                    roughness = replace(roughness, weight=excess * roughness.weight)
+                    hessian += roughness.curvature(path, groups)
+            if roughness is not None:
+                downhill -= roughness.uphill(path, groups)
+            step = np.linalg.solve(hessian, downhill).reshape(-1, 3)
+            gain, path, views = self._search(path, views, low, spline, step, state.cost, roughness)
+            if gain < _CONVERGED and fresh:
                 break
-            if gain > 0.3 * old:
+            if gain > 0.3 * old or gain < _CONVERGED:
                 hessian = None
             old = gain
-        return Fit(path, low, shift, spline, self.cost(path.R[-groups:], low.modes))
+        return Fit(path, low, shift, spline, self._cost(views, low.modes), roughness)
+
+    def _degrees(self, groups: int) -> float:
+        """Return roughly the misfit to be expected of the right motion."""
+        return max(self.data_count - len(self.position) - 2 * groups, 0.1 * self.data_count)
 
     def assess(self, fit: Fit) -> Assessment:
         """Return degrees of freedom, covariance and the misfit of each frame and mode of a fit."""
         values = fit.spline.values(fit.low.time)
         R = fit.path.R[-len(values) :]
-        normal, state = self._state(R, fit.low.modes)
-        hessian = self._hessian(R, normal, state, values)
+        views = self._views(R)
+        state = self._state(views, fit.low.modes)
+        hessian = self._hessian(views, state, values)
         size = values.shape[1]
-        covariance = np.asarray(np.linalg.inv(_pinned(hessian, R, values)), float)
-        factor = scipy.linalg.cholesky(normal, lower=True, check_finite=False)
-        inverse, _ = scipy.linalg.lapack.dpotri(factor, lower=True)
-        seen = len(normal) - float(np.trace(inverse))
-        degrees = max(self.data_count - seen - 3 * size + 3 - 2 * self.weights.sum(), 1.0)
+        known = _pinned(hessian, R, values)
+        if fit.roughness is not None:
+            known += fit.roughness.curvature(fit.path, len(values))
+        covariance = np.asarray(np.linalg.inv(known), float)
+        bent = float(np.sum(covariance * hessian))
+        inverse, _ = scipy.linalg.lapack.dpotri(views.factor, lower=True)
+        seen = len(inverse) - float(np.trace(inverse))
+        degrees = max(self.data_count - seen - bent - 2 * self.weights.sum(), 1.0)
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
             degrees=degrees,
@@ -202,62 +231,62 @@ class ObjectModel:
     def _square(self, modes: ComplexArray) -> float:
         return float(np.sum(np.abs(self._root * modes) ** 2))
 
-    def _points(self, R: Array) -> list[Array]:
-        """Return where the frames' modes lie in the object's Fourier space, in units of the lattice."""
+    def _views(self, R: Array) -> _Views:
+        """Return what the orientations alone decide: where the frames look, and the normal matrix."""
         points = (R[:, :, :2] @ self.low.k.T) * self.spacing
-        return [np.ascontiguousarray(points[:, axis].ravel()) for axis in range(3)]
-
-    def _normal(self, R: Array, modes: ComplexArray) -> tuple[Array, Array]:
-        """Return the normal matrix and the right-hand side of the amplitudes, prior included."""
-        points = self._points(R)
-        kernel = _gathered(points, (self._root * self._blob) ** 2, 4 * self._half + 1)
+        at = [np.ascontiguousarray(points[:, axis].ravel()) for axis in range(3)]
+        kernel = _gathered(at, (self._root * self._blob) ** 2, 4 * self._half + 1)
         normal = kernel.ravel()[self._difference]
         normal[np.diag_indices(len(normal))] += 1.0
-        return normal, self._right(points, self._root * modes)
+        return _Views(R, at, normal, scipy.linalg.cholesky(normal, lower=True, check_finite=False))
 
-    def _right(self, points: list[Array], whitened: ComplexArray) -> Array:
+    def _right(self, views: _Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
-        lattice = _gathered(points, self._root * self._blob * whitened, 2 * self._half + 1)
+        lattice = _gathered(views.points, self._root * self._blob * whitened, 2 * self._half + 1)
         return np.asarray(lattice[self._mask])
 
-    def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
+    def _waves(self, views: _Views, amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
         volume = np.zeros((len(amplitudes), *self._mask.shape), complex)
         volume[:, self._mask] = amplitudes
-        values = finufft.nufft3d2(*points, volume, isign=-1, eps=_PRECISION)
+        values = finufft.nufft3d2(*views.points, volume, isign=-1, eps=_PRECISION)
         return np.asarray(self._blob * values.reshape(len(amplitudes), *self._root.shape))
 
-    def _state(self, R: Array, modes: ComplexArray) -> tuple[Array, _State]:
-        """Solve for the object; return its normal matrix and what the gradient needs."""
-        normal, right = self._normal(R, modes)
-        factor = scipy.linalg.cho_factor(normal, lower=True, check_finite=False)
-        amplitude = scipy.linalg.cho_solve(factor, right, check_finite=False)
-        model, *gradient = self._waves(self._points(R), [amplitude, *(amplitude * self.position.T)])
-        g1, g2, g3 = np.einsum("gji,jgk->igk", R, np.array(gradient))
+    def _cost(self, views: _Views, modes: ComplexArray) -> float:
+        right = self._right(views, self._root * modes)
+        half = scipy.linalg.solve_triangular(views.factor, right, lower=True, check_finite=False)
+        return self._square(modes) - float(half @ half)
+
+    def _state(self, views: _Views, modes: ComplexArray) -> _State:
+        """Solve for the object; return what the gradient needs."""
+        right = self._right(views, self._root * modes)
+        amplitude = views.solve(right)
+        model, slopes = self._model(views, amplitude)
+        cost = self._square(modes) - float(right @ amplitude)
+        return _State(amplitude, (modes - model) * self._root, slopes, cost)
+
+    def _model(self, views: _Views, amplitude: Array) -> tuple[ComplexArray, ComplexArray]:
+        """Return ``(G, K)`` modes and their whitened ``(G, K, 5)`` slopes by rotation and shift."""
+        model, *gradient = self._waves(views, [amplitude, *(amplitude * self.position.T)])
+        g1, g2, g3 = np.einsum("gji,jgk->igk", views.R, np.array(gradient))
         k1, k2 = self.low.k.T
         # R → R exp([ε]×) moves the mode at R k by R (ε × k)
         slopes = np.stack([-1j * k2 * g3, 1j * k1 * g3, -1j * (k1 * g2 - k2 * g1)], axis=-1)
         shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
-        state = _State(
-            amplitude,
-            factor,
-            (modes - model) * self._root,
-            np.concatenate([slopes, shifts], axis=-1) * self._root[..., None],
-            self._square(modes) - float(right @ amplitude),
-        )
-        return normal, state
+        return model, np.concatenate([slopes, shifts], axis=-1) * self._root[..., None]
 
-    def _shift_step(self, R: Array, state: _State) -> Array:
+    def _shift_step(self, views: _Views, state: _State) -> Array:
         """Return the shifts that lessen the misfit most while the object follows, by conjugate gradients.
 
         With the object held the shifts would creep, as the object has been fitted to frames out of place.
         """
-        slopes, covariance, points = state.slopes[..., 3:], _shift_covariance(state), self._points(R)
+        slopes, covariance = state.slopes[..., 3:], _shift_covariance(state)
+        lattice = _Lattice(views.points, self._mask)
 
         def curved(shift: Array) -> Array:
             moved = np.einsum("gki,gi->gk", slopes, shift)
-            follows = scipy.linalg.cho_solve(state.factor, self._right(points, moved), check_finite=False)
-            moved -= self._root * self._waves(points, [follows])[0]
+            right = lattice.gathered(self._root * self._blob * moved)
+            moved -= self._root * self._blob * lattice.waves(views.solve(right)).reshape(moved.shape)
             return np.asarray(np.einsum("gki,gk->gi", slopes.conj(), moved).real)
 
         shift = np.zeros(slopes.shape[::2])
@@ -280,23 +309,32 @@ class ObjectModel:
         return shift
 
     def _search(
-        self, path: Path, low: LowBand, spline: Spline, hessian: Array, state: _State, values: Array
-    ) -> tuple[float, Path]:
-        """Return the gain of the Newton step, shortened until it helps, and the path it leads to."""
-        groups = len(values)
-        gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
-        downhill = (values.T @ gradient).ravel()
-        pinned = _pinned(hessian, path.R[-groups:], values)
-        step = np.linalg.solve(pinned, downhill).reshape(-1, 3)
+        self,
+        path: Path,
+        views: _Views,
+        low: LowBand,
+        spline: Spline,
+        step: Array,
+        cost: float,
+        roughness: Roughness | None,
+    ) -> tuple[float, Path, _Views]:
+        """Return the gain of the Newton step, shortened until it helps, and where it leads to."""
+        groups = len(low.time)
+
+        def rough(path: Path) -> float:
+            return 0.0 if roughness is None else roughness.penalty(path, groups)
+
+        old = cost + rough(path)
         for _ in range(6):
             tried = path.bent(spline, step)
-            gain = state.cost - self.cost(tried.R[-groups:], low.modes)
+            seen = self._views(tried.R[-groups:])
+            gain = old - self._cost(seen, low.modes) - rough(tried)
             if gain > 0:
-                return gain, tried
+                return gain, tried, seen
             step = step / 4
-        return 0.0, path
+        return 0.0, path, views
 
-    def _hessian(self, R: Array, normal: Array, state: _State, values: Array) -> Array:
+    def _hessian(self, views: _Views, state: _State, values: Array) -> Array:
         """Return half the Hessian by the spline's coefficients, object and shifts eliminated."""
         curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
         inverse = _shift_covariance(state)
@@ -305,21 +343,21 @@ class ObjectModel:
         root = np.linalg.cholesky(inverse)
         scale = self._blob * np.sqrt(self._share / self.variance)
         size = values.shape[1]
-        coupling = np.zeros((size, len(normal), 3))
-        reduced = normal.copy()
+        coupling = np.zeros((size, len(views.normal), 3))
+        reduced = views.normal.copy()
         stack: list[Array] = []
-        for g, (rotation, slopes) in enumerate(zip(R, state.slopes, strict=True)):
+        for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
             column = self._back_projected(rotation, slopes * (scale * np.sqrt(self.weights[g]))[:, None])
             turned = column[:, :3] - column[:, 3:] @ carry[g].T
             for b in np.flatnonzero(values[g]):
                 coupling[b] += values[g, b] * turned
             stack.append(column[:, 3:] @ root[g])
-            if len(stack) == 256 or g == len(R) - 1:
+            if len(stack) == 256 or g == len(views.R) - 1:
                 shifts = np.concatenate(stack, axis=1)
                 reduced -= shifts @ shifts.T
                 stack = []
         factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
-        flat = coupling.transpose(1, 0, 2).reshape(len(normal), -1)
+        flat = coupling.transpose(1, 0, 2).reshape(len(reduced), -1)
         half = scipy.linalg.solve_triangular(factor, flat, lower=True, overwrite_b=True, check_finite=False)
         direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
         return np.asarray(direct - half.T @ half)
@@ -334,11 +372,45 @@ class ObjectModel:
 
 
 @dataclass(frozen=True)
+class _Views:
+    """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix."""
+
+    R: Array
+    points: list[Array]
+    normal: Array
+    factor: Array
+
+    def solve(self, right: Array) -> Array:
+        """Return the amplitudes for a right-hand side."""
+        return np.asarray(scipy.linalg.cho_solve((self.factor, True), right, check_finite=False))
+
+
+class _Lattice:
+    """Sums over the lattice and over the frames, many times for the same orientations, roughly."""
+
+    def __init__(self, points: list[Array], mask: NDArray[np.bool_]) -> None:
+        self._mask = mask
+        self._up = finufft.Plan(1, mask.shape, eps=_ROUGH_PRECISION, isign=1)
+        self._down = finufft.Plan(2, mask.shape, eps=_ROUGH_PRECISION, isign=-1)
+        self._up.setpts(*points)
+        self._down.setpts(*points)
+
+    def gathered(self, values: ComplexArray) -> Array:
+        """Return ``(n,)`` sums over the frames' modes."""
+        return np.asarray(self._up.execute(values.ravel()).real[self._mask])
+
+    def waves(self, amplitude: Array) -> ComplexArray:
+        """Return the modes, flat, of ``(n,)`` amplitudes."""
+        volume = np.zeros(self._mask.shape, complex)
+        volume[self._mask] = amplitude
+        return np.asarray(self._down.execute(volume))
+
+
+@dataclass(frozen=True)
 class _State:
     """The object for one motion; residual and slopes are whitened."""
 
     amplitude: Array
-    factor: tuple[Array, bool]
     residual: ComplexArray
     slopes: ComplexArray
     cost: float

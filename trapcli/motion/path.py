@@ -32,6 +32,11 @@ class Spline:
         """Number of basis functions."""
         return self.intervals + 3
 
+    @property
+    def grid(self) -> Array:
+        """Times of the knots and of the middles between them, ``(2 · intervals + 1,)``."""
+        return np.linspace(self.start, self.end, 2 * self.intervals + 1)
+
     def values(self, time: Array) -> Array:
         """Return ``(N, size)`` values of the basis functions."""
         return np.asarray(BSpline.design_matrix(self._scaled(time), self._knots(), 3).toarray())
