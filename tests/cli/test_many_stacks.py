@@ -335,8 +335,8 @@ def test_a_cluster_can_be_interrupted(cluster: Cluster, stacks: Any) -> None:
     names = stacks(60)
     command = [*PROGRAM, "estimate", *names, *PAPER, "--scheduler", cluster.address]
     with started(command) as running:
-        assert running.stdout
-        assert running.stdout.readline() == "s000.h5\n"
+        while not times() and running.poll() is None:
+            time.sleep(0.02)
         running.send_signal(signal.SIGINT)
         _, err = running.communicate(timeout=30)
     assert (running.returncode, err.strip()) == (130, "trap-motion: interrupted")

@@ -224,3 +224,24 @@ def test_a_cell_by_wave_optics() -> None:
     tilts = [axis, axis * [1, 1, -1]]
     paths = [Rotation.from_rotvec(np.outer(time * rate, s * a)).as_matrix() for a in tilts for s in (1, -1)]
     assert min(np.rad2deg(align(found.R, path)[0].mean()) for path in paths) < 1.5
+
+
+@pytest.mark.slow
+def test_rotation_about_the_optical_axis(few_starts: None) -> None:
+    """Seen from one side only: ω₃ is known, α is 0 within its error, φ is undefined."""
+    images, truth = render("single-axis", "blobs", seed=2, tilt=90.0)
+    found = estimate(images, truth.time)
+    assert found.identifiable
+    assert "optical axis" in found.verdict
+    assert (found.flags & np.uint16(Flag.ALPHA_ZERO) > 0).all()
+    assert np.isnan(found.phi).all()
+    assert (found.alpha < 2 * found.alpha_errors).all()
+    assert found.omega_3 == pytest.approx(truth.omega_3, rel=0.05)
+    assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 0.2
+
+
+def test_an_axis_near_the_optical_one_is_not_taken_for_it(few_starts: None) -> None:
+    images, truth = render("single-axis", "blobs", seed=2, tilt=80.0)
+    found = estimate(images, truth.time)
+    assert found.identifiable
+    assert np.median(np.abs(found.alpha / truth.alpha - 1)) < 0.1

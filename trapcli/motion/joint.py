@@ -7,6 +7,7 @@ per degree of freedom, is 1 where pixel noise explains it: the certificate of th
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
-from trapcli.motion.path import Path, Spline
+from trapcli.motion.path import Path, Spline, align
 from trapcli.motion.translation import translation
 from trapcli.motion.types import ReducedMap
 from trapcli.result.motion import Flag, Motion
@@ -53,6 +54,9 @@ _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is w
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _CERTIFIED = 1.08  # misfit per degree of freedom that pixel noise explains
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
+_NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
+_SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
+_MOST_REFINED = 4  # hypotheses that are refined at most
 _UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
@@ -119,9 +123,16 @@ def estimate_joint(
             "nothing changes between the frames beyond the noise: the object is still, "
             "or turns about an axis of symmetry; no rotation can be told",
         )
-    hypotheses = _hypotheses(stack, used, pace, progress)
-    fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in hypotheses]
-    fit, assessment = min(fits, key=lambda refined: refined[0].cost)
+    best: tuple[Fit, Assessment] | None = None
+    refined = 0
+    for found in _hypotheses(stack, used, pace, progress):
+        fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
+        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost)
+        refined += len(fits)
+        if _judge(*best).identifiable or refined >= _MOST_REFINED:
+            break
+    assert best is not None
+    fit, assessment = best
     return _motion(stack, fit, assessment, _judge(fit, assessment), pixel_size)
 
 
@@ -197,21 +208,25 @@ def _grouped(stack: _Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedM
 
 def _hypotheses(
     stack: _Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
-) -> list[Hypothesis]:
-    """Return the motions that common lines and moments allow, best first."""
+) -> Iterator[list[Hypothesis]]:
+    """Yield motions that common lines and moments allow, best first, until one of them is good enough."""
     size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
     reduced, low = _grouped(stack, used, size)
     evidence = Evidence(low.time, LineTable(reduced, _LINE_ERROR), MomentTable(low, _MOMENT_ERROR))
-    best: list[Hypothesis] = []
+    waiting: list[Hypothesis] = []
+    yielded: list[Hypothesis] = []
     for attempt, (window, middle) in enumerate(_ATTEMPTS):
         tried = replace(evidence, seed=attempt)
-        found = find_branches(tried, window=window, middle=middle, progress=progress)
-        judged = sorted((evidence.judge(h.path) for h in found), key=lambda h: h.cost)
-        if not best or judged[0].cost < best[0].cost:
-            best = judged
-        if best[0].lines < _FITS and best[0].moments < _FITS:
-            break
-    return [h for h in best[:2] if h.cost <= _RIVAL * best[0].cost]
+        for path in (h.path for h in find_branches(tried, window=window, middle=middle, progress=progress)):
+            if all(align(path.R, h.path.R)[0].mean() > _SAME for h in yielded):
+                waiting.append(evidence.judge(path))
+        waiting.sort(key=lambda h: h.cost)
+        fits = waiting and waiting[0].lines < _FITS and waiting[0].moments < _FITS
+        if fits or (waiting and attempt == len(_ATTEMPTS) - 1):
+            chosen = [h for h in waiting[:2] if h.cost <= _RIVAL * waiting[0].cost]
+            yield chosen
+            yielded += chosen
+            waiting = []
 
 
 def _refine(
@@ -237,6 +252,16 @@ def _refine(
     model = ObjectModel(low, band)
     fit = model.fit(path, low.time, fine, smooth=not knots)
     assessment = model.assess(fit)
+    omega = np.median(np.abs(fit.path.omega), axis=0)
+    if np.hypot(omega[0], omega[1]) < _NEARLY_PLANAR * omega[2]:
+        planar = model.fit(fit.path.planar(), low.time, fine, smooth=not knots, axes=(2,))
+        simpler = model.assess(planar)
+        misfit = max(fit.cost / assessment.degrees, 1.0)
+        # seen from one side only, the object has fewer parameters too
+        fewer = max(simpler.degrees - assessment.degrees, 0.0)
+        if planar.cost - fit.cost < misfit * (fewer + _SIGNIFICANT * np.sqrt(2 * fewer)):
+            # how far out of the image plane it might turn is what the richer motion tells
+            fit, assessment = planar, replace(simpler, covariance=assessment.covariance)
     if fit.cost / assessment.degrees > _CERTIFIED:
         return _with_model_error(fit, assessment, band)
     return fit, assessment
@@ -252,7 +277,7 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
     """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
     excess = np.maximum(assessment.mode_misfit, 1.0)
     model = ObjectModel(fit.low, band, variance=fit.low.variance * excess)
-    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None)
+    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
     return again, replace(honest, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess)
@@ -270,7 +295,10 @@ def _judge(fit: Fit, assessment: Assessment) -> _Verdict:
     """Say whether the misfit is what the noise leaves, or what else it is."""
     misfit = fit.cost / assessment.degrees
     if misfit <= _CERTIFIED:
-        return _Verdict(True, f"the motion explains the images: misfit {misfit:.3f} of what the noise gives")
+        text = f"the motion explains the images: misfit {misfit:.3f} of what the noise gives"
+        if fit.axes == (2,):
+            text += "; it turns about the optical axis alone, as far as can be told: phi is undefined"
+        return _Verdict(True, text)
     changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
     share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
     left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
@@ -335,7 +363,7 @@ def _motion(stack: _Stack, fit: Fit, assessment: Assessment, verdict: _Verdict, 
     R_covariance = _rotation_covariance(R, values, assessment.covariance)
     omega_covariance = _omega_covariance(omega, values, slopes, assessment.covariance)
     alpha = np.hypot(omega[:, 0], omega[:, 1])
-    v = omega[:, :2] / np.maximum(alpha, 1e-300)[:, None]
+    v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
     across = np.stack([-v[:, 1], v[:, 0]], axis=1)
     plane = omega_covariance[:, :2, :2]
     alpha_errors = np.sqrt(np.einsum("ni,nij,nj->n", v, plane, v))

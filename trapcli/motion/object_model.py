@@ -56,6 +56,8 @@ class Fit:
         Misfit to the data.
     roughness:
         What counted beside the misfit; None where the spline alone smoothes.
+    axes:
+        Lab axes about which the path was bent.
     """
 
     path: Path
@@ -64,6 +66,7 @@ class Fit:
     spline: Spline
     cost: float
     roughness: Roughness | None
+    axes: tuple[int, ...] = (0, 1, 2)
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,8 @@ class Assessment:
     ----------
     degrees:
         Expected misfit: ``fit.cost / degrees`` is 1 where the noise explains it.
+    parameters:
+        Effective number of parameters of the motion.
     covariance:
         ``(size, 3, size, 3)`` covariance of the spline's coefficients.
     frame_misfit, mode_misfit:
@@ -85,6 +90,7 @@ class Assessment:
     """
 
     degrees: float
+    parameters: float
     covariance: Array
     frame_misfit: Array
     mode_misfit: Array
@@ -147,7 +153,14 @@ class ObjectModel:
         return self._cost(self._views(R), modes)
 
     def fit(
-        self, path: Path, times: Array, spline: Spline, *, smooth: bool = True, steps: int = _STEPS
+        self,
+        path: Path,
+        times: Array,
+        spline: Spline,
+        *,
+        smooth: bool = True,
+        axes: tuple[int, ...] = (0, 1, 2),
+        steps: int = _STEPS,
     ) -> Fit:
         """Bend `path` to the least misfit (Gauss–Newton on the projected misfit).
 
@@ -161,10 +174,13 @@ class ObjectModel:
             What bends the path.
         smooth:
             Whether roughness of ω counts, with a weight found from the data.
+        axes:
+            Lab axes about which the path is bent.
         """
         groups = len(times)
         values = spline.values(times)
-        roughness = Roughness(spline) if smooth else None
+        roughness = Roughness(spline, axes) if smooth else None
+        bent = _coefficients(spline, axes)
         low, shift = self.low, np.zeros((groups, 2))
         hessian: Array | None = None
         old = np.inf
@@ -174,11 +190,11 @@ class ObjectModel:
             shift, low = shift + moved, low.shifted(moved)
             state = self._state(views, low.modes)
             gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
-            downhill = (values.T @ gradient).ravel()
+            downhill = (values.T @ gradient).ravel()[bent]
             fresh = hessian is None
             if hessian is None:
                 curvature = self._hessian(views, state, values)
-                hessian = _pinned(curvature, path.R[-groups:], values)
+                hessian = _pinned(curvature, path.R[-groups:], values)[np.ix_(bent, bent)]
                 if roughness is not None:
                     # far from the motion the misfit is large, and must not call for wiggles
                     excess = max(1.0, state.cost / self._degrees(groups))
@@ -187,14 +203,15 @@ class ObjectModel:
                     hessian += roughness.curvature(path, groups)
             if roughness is not None:
                 downhill -= roughness.uphill(path, groups)
-            step = np.linalg.solve(hessian, downhill).reshape(-1, 3)
+            step = np.zeros((spline.size, 3))
+            step.flat[bent] = np.linalg.solve(hessian, downhill)
             gain, path, views = self._search(path, views, low, spline, step, state.cost, roughness)
             if gain < _CONVERGED and fresh:
                 break
             if gain > 0.3 * old or gain < _CONVERGED:
                 hessian = None
             old = gain
-        return Fit(path, low, shift, spline, self._cost(views, low.modes), roughness)
+        return Fit(path, low, shift, spline, self._cost(views, low.modes), roughness, axes)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -208,17 +225,20 @@ class ObjectModel:
         state = self._state(views, fit.low.modes)
         hessian = self._hessian(views, state, values)
         size = values.shape[1]
-        known = _pinned(hessian, R, values)
+        bent = np.ix_(*2 * (_coefficients(fit.spline, fit.axes),))
+        known = _pinned(hessian, R, values)[bent]
         if fit.roughness is not None:
             known += fit.roughness.curvature(fit.path, len(values))
-        covariance = np.asarray(np.linalg.inv(known), float)
-        bent = float(np.sum(covariance * hessian))
+        covariance = np.zeros_like(hessian)
+        covariance[bent] = np.linalg.inv(known)
+        parameters = float(np.sum(covariance * hessian))
         inverse, _ = scipy.linalg.lapack.dpotri(views.factor, lower=True)
         seen = len(inverse) - float(np.trace(inverse))
-        degrees = max(self.data_count - seen - bent - 2 * self.weights.sum(), 1.0)
+        degrees = max(self.data_count - seen - parameters - 2 * self.weights.sum(), 1.0)
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
             degrees=degrees,
+            parameters=parameters,
             covariance=covariance.reshape(size, 3, size, 3),
             frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
@@ -383,6 +403,11 @@ class _Views:
     def solve(self, right: Array) -> Array:
         """Return the amplitudes for a right-hand side."""
         return np.asarray(scipy.linalg.cho_solve((self.factor, True), right, check_finite=False))
+
+
+def _coefficients(spline: Spline, axes: tuple[int, ...]) -> NDArray[np.intp]:
+    """Return the places of the coefficients of some axes among all."""
+    return (3 * np.arange(spline.size)[:, None] + axes).ravel()
 
 
 class _Lattice:

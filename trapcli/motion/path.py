@@ -100,6 +100,13 @@ class Path:
         omega = turn.inv().apply(self.omega) + np.einsum("nij,nj->ni", _right_jacobian(delta), slope)
         return Path(self.time, orthonormal(self.R @ turn.as_matrix()), omega)
 
+    def planar(self) -> Path:
+        """Return the part of the path that turns about the optical axis, from its first time on."""
+        R = self.R[0].T @ self.R
+        angle = np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])
+        axis = np.array([0.0, 0.0, 1.0])
+        return Path(self.time, Rotation.from_rotvec(angle[:, None] * axis).as_matrix(), self.omega * axis)
+
     def mean_omega(self) -> Array:
         """Return the ``(N−1, 3)`` constant angular velocities that lead from each time to the next."""
         turns = Rotation.from_matrix(np.swapaxes(self.R[:-1], 1, 2) @ self.R[1:]).as_rotvec()

@@ -21,7 +21,7 @@ from trapcli.motion.path import Path, Spline, cross_matrix
 Array = NDArray[np.float64]
 
 _RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
-_FREE = 9  # constant rotations and an ω that is linear in time cost nothing
+_FREE = 3  # for each axis: a constant rotation and an ω that is linear in time cost nothing
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,14 @@ class Roughness:
     ----------
     spline:
         What bends the path.
+    axes:
+        Lab axes about which the path is bent, out of 0, 1, 2; P coefficients in all.
     weight:
         In units of the misfit for second differences [rad].
     """
 
     spline: Spline
+    axes: tuple[int, ...] = (0, 1, 2)
     weight: float = 0.0
 
     def penalty(self, path: Path, after: int) -> float:
@@ -46,11 +49,11 @@ class Roughness:
         return self.weight * float(np.sum(self._bend(path, after) ** 2))
 
     def uphill(self, path: Path, after: int) -> Array:
-        """Return ``(3 · size,)`` half the gradient of the penalty by the spline's coefficients."""
+        """Return ``(P,)`` half the gradient of the penalty by the spline's coefficients."""
         return np.asarray(self.weight * self._design(path, after).T @ self._bend(path, after))
 
     def curvature(self, path: Path, after: int) -> Array:
-        """Return ``(3 · size, 3 · size)`` half the Hessian of the penalty."""
+        """Return ``(P, P)`` half the Hessian of the penalty."""
         design = self._design(path, after)
         return np.asarray(self.weight * design.T @ design)
 
@@ -60,12 +63,12 @@ class Roughness:
         Parameters
         ----------
         hessian, downhill:
-            ``(3 · size, 3 · size)``, positive definite, and ``(3 · size,)``: bending by x changes the misfit,
+            ``(P, P)``, positive definite, and ``(P,)``: bending by x changes the misfit,
             minus twice a log-likelihood, by ``xᵀ hessian x − 2 downhill · x``.
         """
         bend, design = self._bend(path, after), self._design(path, after)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
-        rank = max(len(hessian) - _FREE, 1)
+        rank = max(len(hessian) - _FREE * len(self.axes), 1)
         unit = float(np.trace(hessian) / np.trace(curvature))
 
         def surprise(decade: float) -> float:
@@ -89,7 +92,7 @@ class Roughness:
         change = np.einsum("mb,ij->mibj", self.spline.slopes(grid), np.eye(3))
         # δω = δ' + ω × δ
         change += np.einsum("mij,mb->mibj", cross_matrix(omega), self.spline.values(grid))
-        rough = np.tensordot(self._difference(), change, (1, 0))
+        rough = np.tensordot(self._difference(), change[..., list(self.axes)], (1, 0))
         return np.asarray(rough.reshape(3 * len(rough), -1))
 
     def _difference(self) -> Array:
