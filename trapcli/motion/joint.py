@@ -251,20 +251,27 @@ def _refine(
         path = coarse.fit(path, low.time, fine).path
     model = ObjectModel(low, band)
     fit = model.fit(path, low.time, fine, smooth=not knots)
-    assessment = model.assess(fit)
-    omega = np.median(np.abs(fit.path.omega), axis=0)
-    if np.hypot(omega[0], omega[1]) < _NEARLY_PLANAR * omega[2]:
-        planar = model.fit(fit.path.planar(), low.time, fine, smooth=not knots, axes=(2,))
-        simpler = model.assess(planar)
-        misfit = max(fit.cost / assessment.degrees, 1.0)
-        # seen from one side only, the object has fewer parameters too
-        fewer = max(simpler.degrees - assessment.degrees, 0.0)
-        if planar.cost - fit.cost < misfit * (fewer + _SIGNIFICANT * np.sqrt(2 * fewer)):
-            # how far out of the image plane it might turn is what the richer motion tells
-            fit, assessment = planar, replace(simpler, covariance=assessment.covariance)
+    fit, assessment = _simplest(model, fit, model.assess(fit))
     if fit.cost / assessment.degrees > _CERTIFIED:
         return _with_model_error(fit, assessment, band)
     return fit, assessment
+
+
+def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
+    """Take a rotation about the optical axis alone instead where it explains the images as well."""
+    omega = np.median(np.abs(fit.path.omega), axis=0)
+    if np.hypot(omega[0], omega[1]) >= _NEARLY_PLANAR * omega[2]:
+        return fit, assessment
+    smooth = fit.roughness is not None
+    planar = model.fit(fit.path.planar(), fit.low.time, fit.spline, smooth=smooth, axes=(2,))
+    simpler = model.assess(planar)
+    misfit = max(fit.cost / assessment.degrees, 1.0)
+    # seen from one side only, the object has fewer parameters too
+    fewer = max(simpler.degrees - assessment.degrees, 0.0)
+    if planar.cost - fit.cost >= misfit * (fewer + _SIGNIFICANT * np.sqrt(2 * fewer)):
+        return fit, assessment
+    # how far out of the image plane it might turn is what the richer motion tells
+    return planar, replace(simpler, covariance=assessment.covariance)
 
 
 def _relative_noise(stack: _Stack) -> float:

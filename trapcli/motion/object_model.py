@@ -10,13 +10,13 @@ lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import finufft
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from trapcli.motion.fourier_slices import back_project, project, slice_points
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline
 from trapcli.motion.roughness import Roughness
@@ -29,7 +29,6 @@ SPACING = 0.7
 
 _MARGIN = 0.3  # lattice beyond the object's radius, in spacings
 _WIDTH = 0.4  # standard deviation of a blob in lattice spacings
-_PRECISION = 1e-13  # of the transforms: the normal matrix spans ten orders of magnitude
 _ROUGH_PRECISION = 1e-7  # where a step is only looked for
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
@@ -77,8 +76,6 @@ class Assessment:
     ----------
     degrees:
         Expected misfit: ``fit.cost / degrees`` is 1 where the noise explains it.
-    parameters:
-        Effective number of parameters of the motion.
     covariance:
         ``(size, 3, size, 3)`` covariance of the spline's coefficients.
     frame_misfit, mode_misfit:
@@ -90,7 +87,6 @@ class Assessment:
     """
 
     degrees: float
-    parameters: float
     covariance: Array
     frame_misfit: Array
     mode_misfit: Array
@@ -238,7 +234,6 @@ class ObjectModel:
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
             degrees=degrees,
-            parameters=parameters,
             covariance=covariance.reshape(size, 3, size, 3),
             frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
@@ -253,23 +248,25 @@ class ObjectModel:
 
     def _views(self, R: Array) -> _Views:
         """Return what the orientations alone decide: where the frames look, and the normal matrix."""
-        points = (R[:, :, :2] @ self.low.k.T) * self.spacing
-        at = [np.ascontiguousarray(points[:, axis].ravel()) for axis in range(3)]
-        kernel = _gathered(at, (self._root * self._blob) ** 2, 4 * self._half + 1)
+        points = slice_points(R, self.low.k, self.spacing)
+        density = ((self._root * self._blob) ** 2).ravel().astype(complex)
+        # the normal matrix spans ten orders of magnitude: it needs the transforms' double precision
+        kernel = back_project(points, density, 4 * self._half + 1)
         normal = kernel.ravel()[self._difference]
         normal[np.diag_indices(len(normal))] += 1.0
-        return _Views(R, at, normal, scipy.linalg.cholesky(normal, lower=True, check_finite=False))
+        return _Views(R, points, normal, scipy.linalg.cholesky(normal, lower=True, check_finite=False))
 
     def _right(self, views: _Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
-        lattice = _gathered(views.points, self._root * self._blob * whitened, 2 * self._half + 1)
+        waves = (self._root * self._blob * whitened).ravel()
+        lattice = back_project(views.points, waves, 2 * self._half + 1)
         return np.asarray(lattice[self._mask])
 
     def _waves(self, views: _Views, amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
         volume = np.zeros((len(amplitudes), *self._mask.shape), complex)
         volume[:, self._mask] = amplitudes
-        values = finufft.nufft3d2(*views.points, volume, isign=-1, eps=_PRECISION)
+        values = project(views.points, volume)
         return np.asarray(self._blob * values.reshape(len(amplitudes), *self._root.shape))
 
     def _cost(self, views: _Views, modes: ComplexArray) -> float:
@@ -447,12 +444,6 @@ def _shift_covariance(state: _State) -> Array:
     curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
     curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
     return np.asarray(np.linalg.inv(curvature), float)
-
-
-def _gathered(points: list[Array], values: NDArray[Any], size: int) -> Array:
-    """Return ``Re Σ values exp(i⟨point, b⟩)`` at the lattice points b of a cube of `size` points an edge."""
-    flat = values.ravel().astype(complex)
-    return np.asarray(finufft.nufft3d1(*points, flat, (size,) * 3, isign=1, eps=_PRECISION).real)
 
 
 def _pinned(hessian: Array, R: Array, values: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from trapcli.reconstruction.fourier_slices import (
+from trapcli.motion.fourier_slices import (
     NormalOperator,
     back_project,
     circulant_density,

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.errors import ConfigError, InputError
+from trapcli.motion.fourier_slices import project, slice_points
 from trapcli.reconstruction.coverage import Coverage, cover
-from trapcli.reconstruction.fourier_slices import project, slice_points
 from trapcli.reconstruction.resolution import Resolution, resolve
 from trapcli.reconstruction.slices import SliceReader, Survey, survey
 from trapcli.reconstruction.solver import Lattice, Solver, accumulate, ball

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from trapcli.reconstruction.fourier_slices import (
+from trapcli.motion.fourier_slices import (
     NormalOperator,
     back_project,
     circulant_density,
