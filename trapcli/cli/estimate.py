@@ -270,9 +270,8 @@ def _executed(
                 next(completed)
                 overall.advance()
             yield _result(job, futures[n])
-    finally:
-        for future in futures.values():
-            future.cancel()
+    finally:  # not one by one: Dask's executor may be setting the result of one that is cancelled here
+        executor.shutdown(wait=False)
 
 
 def _result(job: Job, future: Future[Outcome]) -> Outcome:

@@ -73,7 +73,8 @@ def cluster(address: str, console: Console) -> Iterator[Executor]:
         import dask
 
         # what workers do is told by what becomes of the inputs; read when distributed is loaded
-        quiet = {"distributed": "critical", "distributed.client": "critical"}
+        names = ("distributed", "distributed.client", "tornado.application")
+        quiet = dict.fromkeys(names, "critical")
         with dask.config.set({"logging": quiet}):
             from distributed import Client
     except ImportError:
