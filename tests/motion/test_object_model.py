@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from trapcli.motion.joint import _rotation_covariance
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline, align
+from trapcli.motion.verdict import _rotation_covariance
 from trapcli.simulation.motions import Tumbling
 from trapcli.simulation.phantoms import Blobs
 

@@ -8,7 +8,7 @@ per degree of freedom, is 1 where pixel noise explains it: the certificate of th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
 from trapcli.motion.branch import Evidence, Hypothesis, find_branches
-from trapcli.motion.centers import Centers, Progress
+from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Path, Spline, align
-from trapcli.motion.translation import translation
 from trapcli.motion.types import ReducedMap
-from trapcli.result.motion import Flag, Motion
+from trapcli.motion.verdict import CERTIFIED, Stack, judge, nothing_known, to_motion
+from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
@@ -52,13 +52,9 @@ _RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refine
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
-_CERTIFIED = 1.08  # misfit per degree of freedom that pixel noise explains
-_MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
 _MOST_REFINED = 4  # hypotheses that are refined at most
-_UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
-_FAINT = 2.0  # standard deviations below which α does not differ from 0
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
 
@@ -114,11 +110,11 @@ def estimate_joint(
     fine_band = config.band or _FINE_BAND / centers.radius
     outlying = np.zeros(len(time), bool)
     outlying[seen] = _outliers(low.select(np.flatnonzero(seen)))
-    stack = _Stack(reduced, low, centers, seen, outlying, attenuation.index)
+    stack = Stack(reduced, low, centers, seen, outlying, attenuation.index)
     used = np.flatnonzero(seen & ~outlying)
     pace = _turn_per_frame(reduced.samples[used], reduced.noise)
     if pace == 0.0:
-        return _nothing_known(
+        return nothing_known(
             stack,
             "nothing changes between the frames beyond the noise: the object is still, "
             "or turns about an axis of symmetry; no rotation can be told",
@@ -129,29 +125,11 @@ def estimate_joint(
         fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
         best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost)
         refined += len(fits)
-        if _judge(*best).identifiable or refined >= _MOST_REFINED:
+        if judge(*best).identifiable or refined >= _MOST_REFINED:
             break
     assert best is not None
     fit, assessment = best
-    return _motion(stack, fit, assessment, _judge(fit, assessment), pixel_size)
-
-
-@dataclass(frozen=True)
-class _Stack:
-    """What is known of the frames before any motion."""
-
-    reduced: ReducedMap
-    low: LowBand
-    centers: Centers
-    seen: Bools
-    outlying: Bools
-    frame: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Verdict:
-    identifiable: bool
-    text: str
+    return to_motion(stack, fit, assessment, judge(fit, assessment), pixel_size)
 
 
 def _outliers(low: LowBand) -> Bools:
@@ -197,7 +175,7 @@ def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float
     return float(max(within, overall) / lags[first])
 
 
-def _grouped(stack: _Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
+def _grouped(stack: Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
     """Return means over groups of `size` consecutive used frames."""
     low = stack.low.select(used).grouped(size)
     groups = len(low.time)
@@ -207,7 +185,7 @@ def _grouped(stack: _Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedM
 
 
 def _hypotheses(
-    stack: _Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
+    stack: Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
 ) -> Iterator[list[Hypothesis]]:
     """Yield motions that common lines and moments allow, best first, until one of them is good enough."""
     size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
@@ -230,7 +208,7 @@ def _hypotheses(
 
 
 def _refine(
-    stack: _Stack, used: NDArray[np.intp], hypothesis: Hypothesis, pace: float, band: float, knots: int
+    stack: Stack, used: NDArray[np.intp], hypothesis: Hypothesis, pace: float, band: float, knots: int
 ) -> tuple[Fit, Assessment]:
     """Fit the object model along a hypothesis, with as many knots as the data pay for."""
     fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
@@ -252,7 +230,7 @@ def _refine(
     model = ObjectModel(low, band)
     fit = model.fit(path, low.time, fine, smooth=not knots)
     fit, assessment = _simplest(model, fit, model.assess(fit))
-    if fit.cost / assessment.degrees > _CERTIFIED:
+    if fit.cost / assessment.degrees > CERTIFIED:
         return _with_model_error(fit, assessment, band)
     return fit, assessment
 
@@ -274,7 +252,7 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     return planar, replace(simpler, covariance=assessment.covariance)
 
 
-def _relative_noise(stack: _Stack) -> float:
+def _relative_noise(stack: Stack) -> float:
     """Return the pixel noise as a share of a typical attenuation of the object."""
     area = np.pi * stack.centers.radius**2
     return float(stack.centers.noise * area / np.nanmedian(stack.low.mass)) / 3
@@ -296,171 +274,3 @@ def _resampled(path: Path, spline: Spline, times: Array) -> Path:
     ascending, back = np.unique(times, return_inverse=True)
     smooth = Path.smooth(spline, spline.fit(middle, path.mean_omega()), ascending)
     return Path(times, smooth.R[back], smooth.omega[back])
-
-
-def _judge(fit: Fit, assessment: Assessment) -> _Verdict:
-    """Say whether the misfit is what the noise leaves, or what else it is."""
-    misfit = fit.cost / assessment.degrees
-    if misfit <= _CERTIFIED:
-        text = f"the motion explains the images: misfit {misfit:.3f} of what the noise gives"
-        if fit.axes == (2,):
-            text += "; it turns about the optical axis alone, as far as can be told: phi is undefined"
-        return _Verdict(True, text)
-    changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
-    share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
-    left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
-    error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
-    if error <= _MODEL_ERROR:
-        return _Verdict(
-            True,
-            f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
-            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it",
-        )
-    return _Verdict(
-        False,
-        f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them "
-        f"is left over, {misfit:.1f} times the noise",
-    )
-
-
-def _nothing_known(stack: _Stack, text: str) -> Motion:
-    """Return a result without rotation."""
-    n = len(stack.low.time)
-    unknown = np.full(n, np.nan)
-    flags = _flags(stack)
-    flags[stack.seen] |= np.uint16(Flag.ALPHA_ZERO | Flag.AMBIGUOUS_PHI)
-    R = np.full((n, 3, 3), np.nan)
-    return Motion(
-        time=stack.low.time,
-        frame=stack.frame,
-        T=translation(stack.centers.center),
-        center=stack.centers.center,
-        phi=unknown,
-        omega_3=unknown,
-        alpha=unknown,
-        R=R,
-        T_errors=np.hypot(stack.centers.errors, stack.centers.errors[np.flatnonzero(stack.seen)[0]]),
-        phi_errors=unknown,
-        omega_3_errors=unknown,
-        alpha_errors=unknown,
-        R_errors=np.full((n, 3), np.nan),
-        valid=np.zeros(n, np.uint8),
-        flags=flags,
-        residual=unknown,
-        identifiable=False,
-        verdict=text,
-    )
-
-
-def _flags(stack: _Stack) -> NDArray[np.uint16]:
-    flags = np.zeros(len(stack.seen), np.uint16)
-    flags[~stack.seen] |= np.uint16(Flag.BLANK)
-    flags[stack.centers.clipped] |= np.uint16(Flag.CLIPPED)
-    flags[stack.outlying] |= np.uint16(Flag.OUTLIER)
-    return flags
-
-
-def _motion(stack: _Stack, fit: Fit, assessment: Assessment, verdict: _Verdict, pixel_size: float) -> Motion:
-    """Put the fitted path into the gauge of the result, with errors and flags."""
-    time = stack.low.time
-    n = len(time)
-    R, omega = fit.path.R[:n], fit.path.omega[:n]
-    R = R[0].T @ R
-    values, slopes = fit.spline.values(time), fit.spline.slopes(time)
-    R_covariance = _rotation_covariance(R, values, assessment.covariance)
-    omega_covariance = _omega_covariance(omega, values, slopes, assessment.covariance)
-    alpha = np.hypot(omega[:, 0], omega[:, 1])
-    v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
-    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
-    plane = omega_covariance[:, :2, :2]
-    alpha_errors = np.sqrt(np.einsum("ni,nij,nj->n", v, plane, v))
-    sideways = np.sqrt(np.einsum("ni,nij,nj->n", across, plane, across))
-    R_errors = np.sqrt(np.maximum(np.diagonal(R_covariance, axis1=1, axis2=2), 0.0))
-
-    flags = _flags(stack)
-    lost = np.linalg.norm(R_errors, axis=1) > _UNKNOWN
-    faint = alpha < _FAINT * np.maximum(alpha_errors, sideways)
-    flags[faint] |= np.uint16(Flag.ALPHA_ZERO)
-    judged = stack.seen & ~lost
-    valid = judged & (flags & np.uint16(Flag.OUTLIER | Flag.BLANK) == 0)
-    text = verdict.text
-    identifiable = verdict.identifiable and bool(valid.mean() > 0.5)
-    if verdict.identifiable and not identifiable:
-        text = (
-            "the images leave the rotation open by more than 20 degrees: "
-            "a symmetric object, too much noise or too little rotation"
-        )
-
-    phi = np.where(judged & ~faint, np.arctan2(omega[:, 1], omega[:, 0]), np.nan)
-    known = np.flatnonzero(np.isfinite(phi))
-    if len(known):
-        phi[known] = np.unwrap(phi[known])
-        first = phi[known[0]]
-        half_turns = np.floor(first / np.pi)
-        # an odd number of half turns is the mirror image, R → ΣRΣ
-        if half_turns % 2:
-            sigma = np.diag([1.0, 1.0, -1.0])
-            R = sigma @ R @ sigma
-        phi = phi - half_turns * np.pi
-    unknown = ~judged
-    center, center_errors = _centers(stack, fit, assessment, pixel_size)
-    size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
-    residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
-    R_errors[unknown] = np.nan
-    R = np.where(unknown[:, None, None], np.nan, R)
-    return Motion(
-        time=time,
-        frame=stack.frame,
-        T=translation(center),
-        center=center,
-        phi=phi,
-        omega_3=np.where(unknown, np.nan, omega[:, 2]),
-        alpha=np.where(unknown, np.nan, alpha),
-        R=R,
-        T_errors=np.hypot(center_errors, center_errors[0]),
-        phi_errors=np.where(np.isfinite(phi), sideways / np.maximum(alpha, 1e-300), np.nan),
-        omega_3_errors=np.where(unknown, np.nan, np.sqrt(omega_covariance[:, 2, 2])),
-        alpha_errors=np.where(unknown, np.nan, alpha_errors),
-        R_errors=R_errors,
-        valid=(valid & identifiable).astype(np.uint8),
-        flags=flags,
-        residual=np.where(stack.seen, residual, np.nan),
-        identifiable=identifiable,
-        verdict=text,
-    )
-
-
-def _centers(stack: _Stack, fit: Fit, assessment: Assessment, pixel_size: float) -> tuple[Array, Array]:
-    """Return the centres C₂ as the object model sees them, and their errors."""
-    groups = len(fit.low.time)
-    own = fit.shift + np.einsum("gji,j->gi", fit.path.R[-groups:], assessment.middle)[:, :2]
-    # where the object's own centre lies is known as well as the mean centroid of all frames
-    lever = np.sqrt(np.pi / 4) * stack.low.radius**2 * pixel_size * stack.centers.noise
-    common = lever / float(np.nanmedian(stack.low.mass)) / np.sqrt(max(stack.seen.sum(), 1))
-    errors = np.hypot(assessment.shift_errors, common)
-
-    def at_frames(series: Array) -> Array:
-        columns = [np.interp(stack.low.time, fit.low.time, column) for column in series.T]
-        return np.stack(columns, axis=1)
-
-    return stack.centers.center + at_frames(own), at_frames(errors)
-
-
-def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
-    """Return ``(N, 3, 3)`` covariances of R as rotation vectors in the lab, R = 1 at the first frame."""
-    # the first frame's error turns all others: ε(t) − R(t)ᵀ R(0) ε(0)
-    back = np.swapaxes(R, 1, 2) @ R[0]
-    own = np.einsum("nb,bicj,nc->nij", values, covariance, values, optimize=True)
-    mixed = np.einsum("nb,bicj,c->nij", values, covariance, values[0], optimize=True)
-    start = np.einsum("b,bicj,c->ij", values[0], covariance, values[0], optimize=True)
-    turned = mixed @ np.swapaxes(back, 1, 2)
-    return np.asarray(own - turned - np.swapaxes(turned, 1, 2) + back @ start @ np.swapaxes(back, 1, 2))
-
-
-def _omega_covariance(omega: Array, values: Array, slopes: Array, covariance: Array) -> Array:
-    """Return ``(N, 3, 3)`` covariances of ω; δω = δ' + ω × δ."""
-    x, y, z = omega.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    design = np.einsum("nb,ij->nibj", slopes, np.eye(3)) + np.einsum("ijn,nb->nibj", cross, values)
-    return np.asarray(np.einsum("nibj,bjck,nlck->nil", design, covariance, design, optimize=True))

@@ -1,0 +1,223 @@
+"""From the fitted path to the result: gauge, errors, flags, and what can't be known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trapcli.motion.centers import Centers
+from trapcli.motion.low_band import LowBand
+from trapcli.motion.object_model import Assessment, Fit
+from trapcli.motion.translation import translation
+from trapcli.motion.types import ReducedMap
+from trapcli.result.motion import Flag, Motion
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+CERTIFIED = 1.08
+"""Misfit per degree of freedom that pixel noise explains."""
+
+_MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
+_UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
+_FAINT = 2.0  # standard deviations below which α does not differ from 0
+
+
+@dataclass(frozen=True)
+class Stack:
+    """What is known of N frames before any motion.
+
+    Attributes
+    ----------
+    reduced, low, centers:
+        What the frames tell of lines, low modes and centres.
+    seen, outlying:
+        ``(N,)`` which frames show an object, and which of them differ from their neighbours.
+    frame:
+        ``(N,)`` the frames' numbers in the input.
+    """
+
+    reduced: ReducedMap
+    low: LowBand
+    centers: Centers
+    seen: Bools
+    outlying: Bools
+    frame: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the motion can be trusted, and why."""
+
+    identifiable: bool
+    text: str
+
+
+def judge(fit: Fit, assessment: Assessment) -> Verdict:
+    """Say whether the misfit is what the noise leaves, or what else it is."""
+    misfit = fit.cost / assessment.degrees
+    if misfit <= CERTIFIED:
+        text = f"the motion explains the images: misfit {misfit:.3f} of what the noise gives"
+        if fit.axes == (2,):
+            text += "; it turns about the optical axis alone, as far as can be told: phi is undefined"
+        return Verdict(True, text)
+    changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
+    share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
+    left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
+    error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
+    if error <= _MODEL_ERROR:
+        return Verdict(
+            True,
+            f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
+            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it",
+        )
+    return Verdict(
+        False,
+        f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them "
+        f"is left over, {misfit:.1f} times the noise",
+    )
+
+
+def nothing_known(stack: Stack, text: str) -> Motion:
+    """Return a result without rotation."""
+    n = len(stack.low.time)
+    unknown = np.full(n, np.nan)
+    flags = _flags(stack)
+    flags[stack.seen] |= np.uint16(Flag.ALPHA_ZERO | Flag.AMBIGUOUS_PHI)
+    R = np.full((n, 3, 3), np.nan)
+    return Motion(
+        time=stack.low.time,
+        frame=stack.frame,
+        T=translation(stack.centers.center),
+        center=stack.centers.center,
+        phi=unknown,
+        omega_3=unknown,
+        alpha=unknown,
+        R=R,
+        T_errors=np.hypot(stack.centers.errors, stack.centers.errors[np.flatnonzero(stack.seen)[0]]),
+        phi_errors=unknown,
+        omega_3_errors=unknown,
+        alpha_errors=unknown,
+        R_errors=np.full((n, 3), np.nan),
+        valid=np.zeros(n, np.uint8),
+        flags=flags,
+        residual=unknown,
+        identifiable=False,
+        verdict=text,
+    )
+
+
+def _flags(stack: Stack) -> NDArray[np.uint16]:
+    flags = np.zeros(len(stack.seen), np.uint16)
+    flags[~stack.seen] |= np.uint16(Flag.BLANK)
+    flags[stack.centers.clipped] |= np.uint16(Flag.CLIPPED)
+    flags[stack.outlying] |= np.uint16(Flag.OUTLIER)
+    return flags
+
+
+def to_motion(stack: Stack, fit: Fit, assessment: Assessment, verdict: Verdict, pixel_size: float) -> Motion:
+    """Put the fitted path into the gauge of the result, with errors and flags."""
+    time = stack.low.time
+    n = len(time)
+    R, omega = fit.path.R[:n], fit.path.omega[:n]
+    R = R[0].T @ R
+    values, slopes = fit.spline.values(time), fit.spline.slopes(time)
+    R_covariance = _rotation_covariance(R, values, assessment.covariance)
+    omega_covariance = _omega_covariance(omega, values, slopes, assessment.covariance)
+    alpha = np.hypot(omega[:, 0], omega[:, 1])
+    v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
+    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
+    plane = omega_covariance[:, :2, :2]
+    alpha_errors = np.sqrt(np.einsum("ni,nij,nj->n", v, plane, v))
+    sideways = np.sqrt(np.einsum("ni,nij,nj->n", across, plane, across))
+    R_errors = np.sqrt(np.maximum(np.diagonal(R_covariance, axis1=1, axis2=2), 0.0))
+
+    flags = _flags(stack)
+    lost = np.linalg.norm(R_errors, axis=1) > _UNKNOWN
+    faint = alpha < _FAINT * np.maximum(alpha_errors, sideways)
+    flags[faint] |= np.uint16(Flag.ALPHA_ZERO)
+    judged = stack.seen & ~lost
+    valid = judged & (flags & np.uint16(Flag.OUTLIER | Flag.BLANK) == 0)
+    text = verdict.text
+    identifiable = verdict.identifiable and bool(valid.mean() > 0.5)
+    if verdict.identifiable and not identifiable:
+        text = (
+            "the images leave the rotation open by more than 20 degrees: "
+            "a symmetric object, too much noise or too little rotation"
+        )
+
+    phi = np.where(judged & ~faint, np.arctan2(omega[:, 1], omega[:, 0]), np.nan)
+    known = np.flatnonzero(np.isfinite(phi))
+    if len(known):
+        phi[known] = np.unwrap(phi[known])
+        first = phi[known[0]]
+        half_turns = np.floor(first / np.pi)
+        # an odd number of half turns is the mirror image, R → ΣRΣ
+        if half_turns % 2:
+            sigma = np.diag([1.0, 1.0, -1.0])
+            R = sigma @ R @ sigma
+        phi = phi - half_turns * np.pi
+    unknown = ~judged
+    center, center_errors = _centers(stack, fit, assessment, pixel_size)
+    size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
+    residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
+    R_errors[unknown] = np.nan
+    R = np.where(unknown[:, None, None], np.nan, R)
+    return Motion(
+        time=time,
+        frame=stack.frame,
+        T=translation(center),
+        center=center,
+        phi=phi,
+        omega_3=np.where(unknown, np.nan, omega[:, 2]),
+        alpha=np.where(unknown, np.nan, alpha),
+        R=R,
+        T_errors=np.hypot(center_errors, center_errors[0]),
+        phi_errors=np.where(np.isfinite(phi), sideways / np.maximum(alpha, 1e-300), np.nan),
+        omega_3_errors=np.where(unknown, np.nan, np.sqrt(omega_covariance[:, 2, 2])),
+        alpha_errors=np.where(unknown, np.nan, alpha_errors),
+        R_errors=R_errors,
+        valid=(valid & identifiable).astype(np.uint8),
+        flags=flags,
+        residual=np.where(stack.seen, residual, np.nan),
+        identifiable=identifiable,
+        verdict=text,
+    )
+
+
+def _centers(stack: Stack, fit: Fit, assessment: Assessment, pixel_size: float) -> tuple[Array, Array]:
+    """Return the centres C₂ as the object model sees them, and their errors."""
+    groups = len(fit.low.time)
+    own = fit.shift + np.einsum("gji,j->gi", fit.path.R[-groups:], assessment.middle)[:, :2]
+    # where the object's own centre lies is known as well as the mean centroid of all frames
+    lever = np.sqrt(np.pi / 4) * stack.low.radius**2 * pixel_size * stack.centers.noise
+    common = lever / float(np.nanmedian(stack.low.mass)) / np.sqrt(max(stack.seen.sum(), 1))
+    errors = np.hypot(assessment.shift_errors, common)
+
+    def at_frames(series: Array) -> Array:
+        columns = [np.interp(stack.low.time, fit.low.time, column) for column in series.T]
+        return np.stack(columns, axis=1)
+
+    return stack.centers.center + at_frames(own), at_frames(errors)
+
+
+def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
+    """Return ``(N, 3, 3)`` covariances of R as rotation vectors in the lab, R = 1 at the first frame."""
+    # the first frame's error turns all others: ε(t) − R(t)ᵀ R(0) ε(0)
+    back = np.swapaxes(R, 1, 2) @ R[0]
+    own = np.einsum("nb,bicj,nc->nij", values, covariance, values, optimize=True)
+    mixed = np.einsum("nb,bicj,c->nij", values, covariance, values[0], optimize=True)
+    start = np.einsum("b,bicj,c->ij", values[0], covariance, values[0], optimize=True)
+    turned = mixed @ np.swapaxes(back, 1, 2)
+    return np.asarray(own - turned - np.swapaxes(turned, 1, 2) + back @ start @ np.swapaxes(back, 1, 2))
+
+
+def _omega_covariance(omega: Array, values: Array, slopes: Array, covariance: Array) -> Array:
+    """Return ``(N, 3, 3)`` covariances of ω; δω = δ' + ω × δ."""
+    x, y, z = omega.T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
+    design = np.einsum("nb,ij->nibj", slopes, np.eye(3)) + np.einsum("ijn,nb->nibj", cross, values)
+    return np.asarray(np.einsum("nibj,bjck,nlck->nil", design, covariance, design, optimize=True))
