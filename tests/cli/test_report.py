@@ -12,6 +12,7 @@ import tifffile
 from trapcli.cli.main import run
 from trapcli.config import EstimateConfig, InputConfig, PreprocessConfig, to_toml
 from trapcli.result.provenance import checksum_line
+from trapcli.stack.tiff import write_volume_tiff
 
 
 def make_stack(folder):
@@ -80,6 +81,40 @@ def test_another_stack(result, capsys):
     assert "gives 10 frames" in capsys.readouterr().err
 
 
+def make_volume(folder):
+    """Write a volume with a bright spot at x = (4, −3, 6) voxels from its middle, in pixels of the stack."""
+    x = np.arange(48) - 24
+    square = (x - 4) ** 2 + (x[:, None] + 3) ** 2 + (x[:, None, None] - 6) ** 2
+    values = np.exp(-square / 18).astype(np.float32)
+    write_volume_tiff(folder / "v.tif", values, voxel_size=1.0, unit="pixel")
+
+
+def test_volume(result, capsys):
+    make_volume(Path())
+    assert call("a.h5", "a.tif", "--volume", "v.tif") == 0
+    assert "does not say that this is the volume" in capsys.readouterr().err
+    assert Path("a.html").read_text().count("<canvas") == 4
+    assert call("a.h5", "--volume", "v.tif", "--overwrite") == 0
+    assert Path("a.html").read_text().count("<canvas") == 3
+
+
+def test_volumes_that_do_not_fit(make_motion, result, capsys):
+    make_volume(Path())
+    make_motion().save("um.h5")
+    write_volume_tiff(Path("flat.tif"), np.ones((3, 9, 9), np.float32), voxel_size=1.0, unit="pixel")
+    for arguments, code, words in (
+        (("um.h5", "--volume", "v.tif"), 3, "v.tif: a volume in pixel does not fit a result in µm"),
+        (("a.h5", "--volume", "flat.tif"), 3, "flat.tif: a volume of shape"),
+        (("a.h5", "--volume", "missing.mrc"), 3, "no such file"),
+        (("a.h5", "--volume", "v.nii"), 2, "no known kind of volume"),
+        (("a.h5", "--volume", "v.tif", "-o", "v.html"), 0, "v.html"),
+    ):
+        assert call(*arguments) == code
+        out, err = capsys.readouterr()
+        assert words in out + err
+        assert (out + err).count("\n") == 1 + (code == 0)
+
+
 def test_a_background_that_is_elsewhere(make_motion, result, capsys):
     config = EstimateConfig(preprocess=PreprocessConfig(background="empty.tif"))
     make_motion(provenance={"configuration": to_toml(config)}).save("b.h5")
@@ -129,15 +164,20 @@ def address(make_motion, tmp_path_factory):
     return (folder / "a.html").as_uri()
 
 
-@pytest.fixture
-def opened(browser, address):
-    """The page as a reader sees it, with what it asked for and complained about."""
+def open_page(browser, address):
+    """Open a page as a reader sees it, noting what it asks for and complains about."""
     page = browser.new_page(viewport={"width": 1000, "height": 900})
     page.asked, page.complaints = [], []
     page.on("request", lambda request: page.asked.append(request.url))
     page.on("console", lambda message: page.complaints.append(message.text))
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
     page.goto(address)
+    return page
+
+
+@pytest.fixture
+def opened(browser, address):
+    page = open_page(browser, address)
     yield page
     page.close()
 
@@ -183,6 +223,88 @@ def test_the_slider_tells_time_and_direction(opened):
     gamma = [float(x) for x in told.split("(")[1].rstrip(")").split(",")]
     exact = [np.sin(0.35) * np.sin(0.55), -np.cos(0.35) * np.sin(0.55), np.cos(0.55)]
     np.testing.assert_allclose(gamma, exact, atol=0.006)
+
+
+@pytest.fixture(scope="module")
+def turning_address(make_motion, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("turning")
+    make_stack(folder)
+    make_result(make_motion, folder)
+    make_volume(folder)
+    assert call(folder / "a.h5", folder / "a.tif", "--volume", folder / "v.tif") == 0
+    return (folder / "a.html").as_uri()
+
+
+@pytest.fixture
+def turning(browser, turning_address):
+    """The page of a volume, its canvases painted."""
+    page = open_page(browser, turning_address)
+    page.wait_for_selector("#turning[data-ready]")
+    yield page
+    assert page.asked == [page.url]
+    # it is the tests that read pixels back
+    assert [words for words in page.complaints if "getImageData" not in words] == []
+    page.close()
+
+
+def spot(page, name):
+    """Middle of what is bright, or on the surface blue, in voxels from the middle of the canvas."""
+    middle = page.evaluate(
+        """name => {
+        const canvas = document.getElementById(name), width = canvas.width;
+        const pixels = canvas.getContext("2d").getImageData(0, 0, width, width).data;
+        let most = 0, count = 0, x = 0, y = 0;
+        for (let i = 2; i < pixels.length; i += 4) most = Math.max(most, pixels[i]);
+        for (let i = 0; i < width * width; i += 1) {
+          const blue = pixels[4 * i + 2], least = name === "shape" ? pixels[4 * i] : most / 2;
+          if (blue > least) { count += 1; x += i % width; y += Math.floor(i / width); }
+        }
+        return [x / count / width, y / count / width]; }""",
+        name,
+    )
+    return 48 * (np.array(middle) - 0.5)
+
+
+def test_the_object_turns_by_the_motion(turning, make_motion):
+    """A point b of the object lies at Rᵀ b, in the projection as on the surface."""
+    motion = make_motion(20)
+    kept = [n for n in range(20) if n not in (4, 5)]
+    for pose in (0, 6, 17):
+        turning.locator("#pose").fill(str(pose))
+        exact = motion.R[kept[pose]].T @ [4, -3, 6]
+        np.testing.assert_allclose(spot(turning, "projection"), exact[:2], atol=0.3)
+        np.testing.assert_allclose(spot(turning, "shape"), exact[:2], atol=0.3)
+        np.testing.assert_allclose(spot(turning, "film"), 0, atol=0.6)
+        assert turning.inner_text("#pose-at") == f"t = {motion.time[kept[pose]]:g} s, frame {2 * kept[pose]}"
+
+
+def test_the_mouse_turns_the_surface(turning):
+    """By a quarter turn to the right what lay in front comes to the right; the projection stays."""
+    before = spot(turning, "projection")
+    turning.locator("#shape").scroll_into_view_if_needed()
+    box = turning.locator("#shape").bounding_box()
+    turning.mouse.move(box["x"] + 40, box["y"] + 100)
+    turning.mouse.down()
+    turning.mouse.move(box["x"] + 40 + 0.4 * np.pi / 2 * box["width"], box["y"] + 100, steps=5)
+    turning.mouse.up()
+    np.testing.assert_allclose(spot(turning, "shape"), [-6, -3], atol=0.4)
+    np.testing.assert_array_equal(spot(turning, "projection"), before)
+    turning.locator("#shape").dblclick()
+    np.testing.assert_allclose(spot(turning, "shape"), [4, -3], atol=0.4)
+
+
+def test_level_and_play(turning):
+    shown = "document.getElementById('shape').toDataURL()"
+    before = turning.evaluate(shown)
+    turning.locator("#level").fill("80")
+    assert turning.inner_text("#level-at") == "80 %"
+    assert turning.evaluate(shown) != before
+    turning.locator("#play").click()
+    assert turning.inner_text("#play") == "Pause"
+    while turning.input_value("#pose") in "01":
+        turning.wait_for_timeout(50)
+    turning.locator("#play").click()
+    assert turning.inner_text("#play") == "Play"
 
 
 def test_it_prints(opened):

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
+from trapcli.report import turning
 from trapcli.report.checks import check_frames
 from trapcli.report.figures import Projection, draw_frames, draw_quality
-from trapcli.report.html import Seen, page, path_on_sphere
+from trapcli.report.html import Seen, Volume, page, path_on_sphere
 from trapcli.report.words import facts, flagged, headline
 from trapcli.result.motion import Flag
 from trapcli.stack.frames import Frames
@@ -59,6 +60,27 @@ def test_nothing_leaves_the_page(make_motion, seen):
     assert len(loading) == 5
     scripts = "".join(elements.texts["script"] + elements.texts["style"])
     assert not re.search(r"https?:|url\(|import|fetch\(|XMLHttpRequest", scripts)
+
+
+@pytest.fixture
+def volume(make_motion):
+    """Random voxels: nothing is harder to pack."""
+    values = np.random.default_rng(0).random((80, 80, 80)).astype(np.float32)
+    return Volume(values, 0.2, "µm", None, turning.prepare(values, 0.2, "µm", make_motion()))
+
+
+def test_nothing_leaves_the_page_with_a_volume(make_motion, seen, volume):
+    film = np.random.default_rng(0).random((40, 200, 200))
+    shown = turning.with_film(volume.turning, Frames.from_array(film), make_motion(), 0.2)
+    text = page(make_motion(), title="a.h5", seen=dataclasses.replace(seen, turning=shown), volume=volume)
+    elements = Elements(text)
+    assert elements.open == []
+    loading = [value for tag, name, value in elements.attributes if name in LOADING]
+    assert all(value.startswith("data:") for value in loading)
+    scripts = "".join(elements.texts["script"] + elements.texts["style"])
+    assert not re.search(r"https?:|url\(|import|fetch\(|XMLHttpRequest", scripts)
+    assert "Frames 0 to 39." in "".join(elements.texts["p"])
+    assert len(text) < 4_000_000
 
 
 def test_words_come_first(make_motion):

@@ -10,6 +10,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 from string import Template
 from typing import Any
 
@@ -18,10 +19,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from trapcli.errors import InputError
-from trapcli.report import figures
+from trapcli.report import figures, turning
 from trapcli.report.checks import FrameChecks, check_frames, findings
 from trapcli.report.figures import Projection
 from trapcli.report.projections import choose, open_again, pixel_size
+from trapcli.report.turning import Turning
+from trapcli.report.volume_page import Judgement, draw_volume
 from trapcli.report.words import facts, flagged, headline
 from trapcli.result import provenance
 from trapcli.result.motion import Motion
@@ -34,6 +37,10 @@ _POINTS = 1500
 """Most points of the path on the sphere."""
 _VECTORS = 4000
 """Longest result whose curves are drawn as vectors; those of longer ones would fill the page's 5 MB."""
+_FILM = (
+    "<figure><canvas id='film'></canvas><figcaption>Video, object kept in the middle</figcaption></figure>"
+)
+_SCRIPTS = ("turnable.js", "sphere.js", "turning.js")
 _TEXTS = {
     "command_line": "command line",
     "inputs": "inputs (SHA-256)",
@@ -44,6 +51,29 @@ _TEXTS = {
     "warnings": "warnings",
     "configuration": "parameters",
 }
+
+
+@dataclass(frozen=True)
+class Volume:
+    """The object that was reconstructed from the frames of a result.
+
+    Attributes
+    ----------
+    values:
+        ``(n, n, n)`` ``[x3, x2, x1]``.
+    voxel_size, unit:
+        Edge of a voxel.
+    judgement:
+        What the result says of it; None where that is of another volume.
+    turning:
+        What the page shows turning.
+    """
+
+    values: NDArray[Any]
+    voxel_size: float
+    unit: str
+    judgement: Judgement | None
+    turning: Turning
 
 
 @dataclass(frozen=True)
@@ -58,6 +88,8 @@ class Seen:
         Whether the files are those of the result, by their checksums.
     notes, warnings:
         What was done to the frames, and what is doubtful about them.
+    turning:
+        The volume with frames beside it; None without a volume.
     """
 
     raw: tuple[Projection, ...]
@@ -66,10 +98,21 @@ class Seen:
     same_files: bool
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
+    turning: Turning | None = None
 
 
-def look_at(stack: str, motion: Motion, progress: Callable[[str, int, int], None] | None = None) -> Seen:
+def look_at(
+    stack: str,
+    motion: Motion,
+    progress: Callable[[str, int, int], None] | None = None,
+    volume: Volume | None = None,
+) -> Seen:
     """Read the frames of a result again, in the way that its own configuration tells.
+
+    Parameters
+    ----------
+    volume:
+        The object that some of the frames shall be shown beside.
 
     Raises
     ------
@@ -97,11 +140,35 @@ def look_at(stack: str, motion: Motion, progress: Callable[[str, int, int], None
     raw = [] if config.preprocess.attenuation else frames.pick(np.array(chosen))
     info = attenuation.info
     return Seen(
-        shown(raw), shown(checks.images), checks, _same_files(frames, motion), info.notes, info.warnings
+        raw=shown(raw),
+        attenuation=shown(checks.images),
+        checks=checks,
+        same_files=_same_files(frames, motion),
+        notes=info.notes,
+        warnings=info.warnings,
+        turning=turning.with_film(volume.turning, attenuation, motion, size) if volume and size else None,
     )
 
 
-def page(motion: Motion, *, title: str, seen: Seen | None = None) -> str:
+def look_at_volume(path: Path, result: Path, motion: Motion) -> Volume:
+    """Read a volume that was reconstructed from the frames of a result.
+
+    Raises
+    ------
+    InputError
+        Where it can't be read, or can't be turned by this motion.
+    """
+    from trapcli.reconstruction.volume_files import read_judgement, read_volume
+
+    values, voxel_size, unit = read_volume(path)
+    try:
+        turned = turning.prepare(values, voxel_size, unit, motion)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return Volume(values, voxel_size, unit, read_judgement(result, path), turned)
+
+
+def page(motion: Motion, *, title: str, seen: Seen | None = None, volume: Volume | None = None) -> str:
     """Return the report on a result as HTML, at most 5 MB that load nothing else.
 
     Parameters
@@ -110,13 +177,15 @@ def page(motion: Motion, *, title: str, seen: Seen | None = None) -> str:
         Name of the result.
     seen:
         What `look_at` found in its stack; without it there are no frames and no checks.
+    volume:
+        The object, shown turning by the motion.
     """
     verdict = headline(motion)
     curves = figures.draw(dataclasses.replace(motion, verdict=""))  # the page says it already
     return _part("page.html").substitute(
         title=_text(title),
         style=_source("page.css"),
-        script=_source("sphere.js"),
+        script="\n".join(_source(name) for name in _SCRIPTS[: 3 if volume else 2]),
         level=verdict.level,
         verdict=_text(verdict.title),
         reason=_text(verdict.text),
@@ -125,6 +194,7 @@ def page(motion: Motion, *, title: str, seen: Seen | None = None) -> str:
         frames=_frames(motion, seen),
         curves=_image(curves, len(motion), "T, φ, ω₃ and α over time with 1-σ bands"),
         path=_json(path_on_sphere(motion)),
+        object=_object(motion, seen, volume),
         quality=_image(figures.draw_quality(motion), len(motion), "residual and flags of each frame"),
         flags=_flags(motion),
         checks=_checks(motion, seen),
@@ -181,6 +251,34 @@ def _frames(motion: Motion, seen: Seen | None) -> str:
         f"{drawn}<p>{above}Cross: tracked centre of the object, with its path. Orange: rotation axis as it "
         "appears in the image; it reaches the dotted circle where it lies in the image plane, and shrinks to "
         "a point where it is the line of sight.</p>"
+    )
+
+
+def _object(motion: Motion, seen: Seen | None, volume: Volume | None) -> str:
+    if not volume:
+        return "<p class='missing'>No volume: give what reconstruct wrote with --volume to see it turn.</p>"
+    shown = (seen.turning if seen else None) or volume.turning
+    at = motion.frame[shown.positions]
+    words = f"Frames {at[0]} to {at[-1]}"
+    if len(at) > 1 and (step := int(np.median(np.diff(at)))) > 1:
+        words += f" in steps of {step}"
+    film = _FILM if shown.film is not None else ""
+    if film:
+        words += (
+            ". Where motion and volume are right, the projection looks like the video without its noise; "
+            "both have one grey scale"
+        )
+    words += (
+        f". Each picture is {len(shown.values) * shown.step:.3g} {shown.unit} wide. Orange: rotation axis. "
+        "A higher level shows what lies inside, in a glassy hull; a double click, the view of the camera."
+    )
+    drawn = draw_volume(volume.values, volume.voxel_size, volume.unit, judgement=volume.judgement)
+    return _part("turning.html").substitute(
+        film=film,
+        words=words,
+        scene=_json(turning.to_json(shown, motion)),
+        samples=turning.packed(shown),
+        figure=_image(drawn, _VECTORS + 1, "slices and maximum projections of the volume"),
     )
 
 
