@@ -4,7 +4,7 @@ python aspire_rotations.py INPUT.npz OUTPUT.npz
 
 INPUT holds stacks ``(N, L, L)`` of centred images by name and ``settings`` ``(S, 2)``: largest image size
 and n_theta. OUTPUT holds ``(N, 3, 3)`` rotations, lab to object, named ``method/stack/setting``, without what
-ASPIRE fails on, and ``version``.
+ASPIRE fails on.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 import sys
 
-import aspire
 import numpy as np
 from aspire.abinitio import CLSync3N, CLSyncVoting
 from aspire.source import ArrayImageSource
@@ -43,7 +42,7 @@ def main() -> None:
     logging.disable(logging.WARNING)
     arrays = dict(np.load(sys.argv[1]))
     settings = arrays.pop("settings")
-    results = {"version": np.array(aspire.__version__)}
+    results = {}
     for name, images in arrays.items():
         for number, (size, n_theta) in enumerate(settings):
             for method, R in rotations(images, int(size), int(n_theta)).items():

@@ -1,118 +1,207 @@
-"""The Cramér–Rao bound of the rotation, with the object and each frame's shift unknown.
+"""The Cramér–Rao bound of the rotation: object and every frame's shift unknown, white noise.
 
-The Fisher information of a spline that bends the true path, given white pixel noise, after the amplitudes of
-a lattice that fills the object's ball and two shifts a frame are eliminated. The error it allows is averaged
-as measured errors are: draws from the covariance go through the same alignment.
+Nothing of the estimators is used. Slopes by rotation come from exact projections of the true object; all that
+the object could be besides, blobs on a lattice that fills its ball, is eliminated, and so are two shifts a
+frame. What is left is the Fisher information of the rotations, and with it that of any spline ω(t).
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
-from scenes import Stack
 from scipy.spatial.transform import Rotation
 
-from trapcli.motion.centers import Centers
-from trapcli.motion.low_band import read_low_band
-from trapcli.motion.object_model import Fit, ObjectModel
 from trapcli.motion.path import Path, Spline, align
-from trapcli.stack.frames import Frames
+from trapcli.simulation.render import Scene
 
 Array = NDArray[np.float64]
 
-REFERENCE = 1e-3
-"""Noise, in peaks, at which the bound is computed: so low that the object's prior counts for little."""
-BAND = 24.0
-"""Band times radius: 96 to 100 % of the information of a known object of these scenes lies below."""
-KNOT_ANGLE = 12.0
-"""Degrees turned per interval of the spline, the middle one of those that the joint estimate chooses from."""
+BAND = 20.0
+"""Highest spatial frequency times the object's radius."""
+VISIBLE = 5e-3
+"""Share of the peak attenuation at which the object ends."""
+PER_CENT = 0.01
+"""Noise, in peaks, for which bounds are stated; they are proportional to it."""
 
+_TURN = np.deg2rad(3.0)  # between the frames whose information is gathered
+_GATHERED = 40, 400  # fewest and most of them
+_TAIL = 4.0  # of a blob that the square to be transformed holds, in standard deviations
+_SPACING = 0.7  # of the lattice, in units of π / band
+_MARGIN = 0.3  # lattice beyond the ball, in spacings
+_WIDTH = 0.4  # standard deviation of a blob, in spacings
+_FAINT = 1e-10  # precision of an amplitude's prior, in units of the best determined amplitude's
+_STEP = np.deg2rad(0.2)  # of the differences by rotation
+_NEGLECTED = 0.1  # share of the bound by which a spline may miss the true motion
 _DRAWS = 200
 
 
 @dataclass(frozen=True)
-class Bound:
-    """Expected errors per unit of noise.
+class Information:
+    """What the frames of a scene tell of their rotations, for noise of one per cent of the peak.
 
     Attributes
     ----------
-    mean, worst:
-        Mean and largest error over the frames [degrees] at noise of 1 % of the peak; proportional to noise.
-    band:
-        Highest spatial frequency times the object's radius.
-    intervals:
-        Intervals of the spline.
+    frame:
+        ``(G,)`` frames, each for those around it.
+    fisher:
+        ``(3G, 3G)`` Fisher information of rotation vectors [1 / rad²], R → R exp([δ]×).
     unknowns:
         Amplitudes of the object.
     """
 
-    mean: float
-    worst: float
-    band: float
-    intervals: int
+    frame: NDArray[np.intp]
+    fisher: Array
     unknowns: int
 
 
-def bounds(stack: Stack, quick: bool) -> dict[str, Any]:
-    """Return the bound, and by which factor its mean changes with what it depends on."""
-    band = BAND - 4 if quick else BAND
-    best, lower = bound(stack, band), bound(stack, band - 4)
-    # what the spline changes hardly depends on the band, but a low band is far cheaper
-    cheap = bound(stack, band / 2)
-    coarse, fine = (bound(stack, band / 2, knot_angle=f * KNOT_ANGLE) for f in (2.0, 0.5))
-    return {
-        **asdict(best),
-        "factor": {
-            "band_lower_by_4": lower.mean / best.mean,
-            "knots_half_as_many": coarse.mean / cheap.mean,
-            "knots_twice_as_many": fine.mean / cheap.mean,
-            "prior_at_noise_10_percent": bound(stack, band, noise=0.1).mean / best.mean,
-        },
-    }
+@dataclass(frozen=True)
+class Bound:
+    """Expected errors at noise of one per cent of the peak, and for which spline.
+
+    Attributes
+    ----------
+    mean, worst:
+        Mean and largest error over the frames [degrees].
+    intervals:
+        Intervals of the cubic spline that ω(t) is.
+    """
+
+    mean: float
+    worst: float
+    intervals: int
 
 
-def bound(stack: Stack, band: float, *, knot_angle: float = KNOT_ANGLE, noise: float = REFERENCE) -> Bound:
-    """Compute the bound for the modes up to `band` / radius; the prior of the object weighs as at `noise`."""
-    truth, n = stack.truth, len(stack.truth)
-    centers = Centers(
-        center=truth.center,
-        errors=np.zeros((n, 2)),
-        mass=np.ones(n),
-        level=np.zeros(n),
-        noise=noise * stack.peak,
-        radius=stack.radius,
-        clipped=np.zeros(n, bool),
+def bound(scene: Scene, information: Information) -> Bound:
+    """Return the bound for the coarsest spline that holds the true motion to a tenth of it."""
+    intervals = 1
+    while True:
+        best = bound_of_spline(scene, information, intervals)
+        if _missed(scene, intervals) < _NEGLECTED * best.mean or intervals >= len(information.frame) // 3:
+            return best
+        intervals += 1
+
+
+def bound_of_spline(scene: Scene, information: Information, intervals: int) -> Bound:
+    """Return the bound where ω(t) is a spline of `intervals`, as averages of draws."""
+    design = _design(scene, intervals)
+    seen = design[information.frame].reshape(-1, design.shape[2])
+    root = np.linalg.inv(np.linalg.cholesky(seen.T @ information.fisher @ seen))
+    # to first order the best constant rotation of the object, R → exp([c]×) R, adds Rᵀc to every frame
+    R = scene.motion.rotations(scene.time)
+    aligned = design - np.swapaxes(R, 1, 2) @ np.mean(R @ design, axis=0)
+    draws = np.random.default_rng(0).standard_normal((_DRAWS, len(root))) @ root
+    angles = np.array([np.linalg.norm(aligned @ draw, axis=1) for draw in draws])
+    mean, worst = np.rad2deg([angles.mean(), angles.max(axis=1).mean()])
+    return Bound(float(mean), float(worst), intervals)
+
+
+def _design(scene: Scene, intervals: int) -> Array:
+    """Return ``(N, 3, P)`` changes of R, as R exp([δ]×), by the P coefficients of ω."""
+    R, time = scene.motion.rotations(scene.time), scene.time
+    values = Spline(time[0], time[-1], intervals).values(time)
+    change = np.einsum("nij,nb->nibj", R, values).reshape(len(time), 3, -1)
+    steps = 0.5 * np.diff(time)[:, None, None] * (change[1:] + change[:-1])
+    summed = np.concatenate([np.zeros((1, *change.shape[1:])), np.cumsum(steps, axis=0)])
+    return np.asarray(np.swapaxes(R, 1, 2) @ summed)
+
+
+def information(scene: Scene, band: float = BAND) -> Information:
+    """Gather the information of a scene in the modes up to `band` over its radius."""
+    frames, pixel = len(scene.time), scene.config.stack.pixel_size
+    parts = np.array_split(
+        np.arange(frames), min(frames, np.clip(turn(scene) / _TURN, *_GATHERED).astype(int))
     )
-    highest = band / stack.radius
-    low = read_low_band(
-        Frames.from_array(stack.clean),
-        centers,
-        time=truth.time,
-        band=highest,
-        pixel_size=stack.pixel_size,
-    )
-    intervals = max(4, round(np.rad2deg(stack.turn) / knot_angle))
-    spline = Spline(truth.time[0], truth.time[-1], intervals)
-    model = ObjectModel(low, highest)
-    path = Path(truth.time, truth.R, np.stack([truth.omega_1, truth.omega_2, truth.omega_3], axis=1))
-    covariance = model.assess(Fit(path, model.low, np.zeros((n, 2)), spline, 0.0)).covariance
-    mean, worst = _expected_errors(truth.R, spline.values(truth.time), covariance)
-    unit = 0.01 / noise
-    return Bound(unit * mean, unit * worst, band, intervals, len(model.position))
+    frame = np.array([part[len(part) // 2] for part in parts])
+    R = scene.motion.rotations(scene.time)[frame]
+    radius = visible_radius(scene)
+    lattice, width = _lattice(radius, band / radius)
+    half = int(np.ceil((np.abs(lattice).max() + _TAIL * width) / pixel))
+    k, kept, share = _modes(half, pixel, band / radius)
+    blob = np.sqrt(share) * np.exp(-0.5 * (width * np.hypot(*k.T)) ** 2)
+
+    n, groups = len(lattice), len(parts)
+    nuisance = np.zeros((n + 2 * groups, n + 2 * groups))
+    coupling = np.zeros((n + 2 * groups, 3 * groups))
+    own = np.zeros((3 * groups, 3 * groups))
+    for g, part in enumerate(parts):
+        weight = np.sqrt(len(part)) / (PER_CENT * scene.peak)
+        model, turned = _slopes(scene, R[g], half)
+        shifted = -1j * k.T * model[kept]
+        slopes = weight * _real(np.stack([*turned[:, kept], *shifted]) * np.sqrt(share)).T
+        phase = lattice @ (R[g, :, :2] @ k.T)
+        waves = weight * _real(np.exp(-1j * phase) * blob)
+        nuisance[:n, :n] += waves @ waves.T
+        shift, rotation = slice(n + 2 * g, n + 2 * g + 2), slice(3 * g, 3 * g + 3)
+        product, inner = waves @ slopes, slopes.T @ slopes
+        coupling[:n, rotation], nuisance[:n, shift] = product[:, :3], product[:, 3:]
+        nuisance[shift, :n] = product[:, 3:].T
+        nuisance[shift, shift], coupling[shift, rotation] = inner[3:, 3:], inner[3:, :3]
+        own[rotation, rotation] = inner[:3, :3]
+    best = np.diag(nuisance)[:n].max()
+    nuisance[np.diag_indices(n)] += _FAINT * best
+    factor = scipy.linalg.cholesky(nuisance, lower=True, overwrite_a=True, check_finite=False)
+    lost = scipy.linalg.solve_triangular(factor, coupling, lower=True, check_finite=False)
+    return Information(frame, own - lost.T @ lost, n)
 
 
-def _expected_errors(R: Array, values: Array, covariance: Array) -> tuple[float, float]:
-    """Return the expected mean and largest angle [degrees] after alignment."""
-    size = values.shape[1]
-    root = np.linalg.cholesky(covariance.reshape(3 * size, 3 * size))
-    rng = np.random.default_rng(0)
-    errors = []
-    for _ in range(_DRAWS):
-        bend = values @ (root @ rng.standard_normal(3 * size)).reshape(size, 3)
-        angles = align(R @ Rotation.from_rotvec(bend).as_matrix(), R)[0]
-        errors.append((angles.mean(), angles.max()))
-    mean, worst = np.rad2deg(np.mean(errors, axis=0))
-    return float(mean), float(worst)
+def turn(scene: Scene) -> float:
+    """Return the angle turned in all [rad]."""
+    speed = np.linalg.norm(scene.motion.omega(scene.time), axis=1)
+    return float(np.trapezoid(speed, scene.time))
+
+
+def visible_radius(scene: Scene) -> float:
+    """Return the distance from its centre at which the object ends, in some frames [length]."""
+    farthest = 0.0
+    R = scene.motion.rotations(scene.time)
+    for n in np.unique(np.linspace(0, len(R) - 1, 16).astype(int)):
+        image = scene.phantom.project(R[n], scene.phantom.center, scene.x1, scene.x2)
+        rows, columns = np.nonzero(image > VISIBLE * scene.peak)
+        farthest = max(farthest, float(np.hypot(scene.x1[columns], scene.x2[rows]).max()))
+    return farthest
+
+
+def _modes(half: int, pixel: float, highest: float) -> tuple[Array, NDArray[np.intp], Array]:
+    """Return k of half of the modes of a square, their places, and how many modes each stands for."""
+    frequency = 2 * np.pi * np.fft.fftfreq(2 * half, pixel)
+    k1, k2 = (k.ravel() for k in np.meshgrid(frequency, frequency))
+    kept = np.flatnonzero((np.hypot(k1, k2) <= highest) & ((k2 > 0) | ((k2 == 0) & (k1 >= 0))))
+    k = np.stack([k1[kept], k2[kept]], axis=1)
+    return k, kept, np.where((k == 0).all(axis=1), 1.0, 2.0)
+
+
+def _lattice(radius: float, highest: float) -> tuple[Array, float]:
+    """Return ``(n, 3)`` points that fill the ball, and the width of their blobs."""
+    spacing = _SPACING * np.pi / highest
+    reach = radius + _MARGIN * spacing
+    axis = spacing * np.arange(-int(reach / spacing), int(reach / spacing) + 1)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    return cube[np.linalg.norm(cube, axis=1) <= reach], _WIDTH * spacing
+
+
+def _slopes(scene: Scene, R: Array, half: int) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return all modes of the centred projection, and their ``(3, …)`` slopes by rotation; white noise."""
+    x = np.arange(-half, half) * scene.config.stack.pixel_size
+
+    def modes(R: Array) -> NDArray[np.complex128]:
+        image = scene.phantom.project(R, scene.phantom.center, x, x)
+        return np.asarray(np.fft.fft2(np.fft.ifftshift(image), norm="ortho")).ravel()
+
+    turns = Rotation.from_rotvec(_STEP * np.eye(3)).as_matrix()
+    slopes = [(modes(R @ turn) - modes(R @ turn.T)) / (2 * _STEP) for turn in turns]
+    return modes(R), np.array(slopes)
+
+
+def _real(values: NDArray[np.complex128]) -> Array:
+    return np.concatenate([values.real, values.imag], axis=-1)
+
+
+def _missed(scene: Scene, intervals: int) -> float:
+    """Return by how much a spline of ω misses the true motion, mean over the frames [degrees]."""
+    spline = Spline(scene.time[0], scene.time[-1], intervals)
+    coefficients = spline.fit(scene.time, scene.motion.omega(scene.time))
+    path = Path.smooth(spline, coefficients, scene.time)
+    return float(np.rad2deg(align(path.R, scene.motion.rotations(scene.time))[0].mean()))

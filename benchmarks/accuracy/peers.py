@@ -8,21 +8,21 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import Images, Stack
 
 Array = NDArray[np.float64]
+Images = NDArray[np.floating[Any]]
 
 REQUIREMENT = "aspire==0.14.3"
 IMAGES = 60
 METHODS = ("CLSync3N", "CLSyncVoting")
 INPUTS = ("single", "averaged")
 """60 single frames, and 60 means of their neighbours: the class averages that ASPIRE is made for."""
-SETTINGS = ((80, 360), (40, 360), (80, 720), (40, 720))
-"""Largest image size and n_theta (ASPIRE's default is 360); of each, the best by true error counts."""
-QUICK_SETTINGS = ((40, 720),)
+SETTINGS = ((80, 360), (40, 720))
+"""Largest image size and n_theta (ASPIRE's default is 360); the better one by true error counts."""
 
 _FOLDER = Path(__file__).parent
 _ENVIRONMENT = _FOLDER / ".venv-aspire"
@@ -35,11 +35,16 @@ class Aspire:
 
     python: Path
 
-    def estimate(
-        self, stack: Stack, frames: Images, settings: tuple[tuple[int, int], ...], inputs: tuple[str, ...]
-    ) -> tuple[dict[str, list[Array]], str]:
-        """Return rotations of the `chosen` frames by ``method/input``, for each setting, and the version."""
-        images = {name: image for name, image in _images(stack, frames).items() if name in inputs}
+    def rotations(
+        self, images: dict[str, Images], settings: tuple[tuple[int, int], ...] = SETTINGS
+    ) -> dict[str, list[Array]]:
+        """Return rotations by ``method/name`` for named stacks of centred images, for each setting.
+
+        Raises
+        ------
+        RuntimeError
+            Where ASPIRE fails on all.
+        """
         with tempfile.TemporaryDirectory() as folder:
             source, target = Path(folder) / "images.npz", Path(folder) / "rotations.npz"
             np.savez(source, settings=np.array(settings), **images)  # type: ignore[arg-type]
@@ -52,9 +57,8 @@ class Aspire:
             results = dict(np.load(target))
         found: dict[str, list[Array]] = {}
         for name, R in results.items():
-            if name != "version":
-                found.setdefault(name.rpartition("/")[0], []).append(R)
-        return found, str(results["version"])
+            found.setdefault(name.rpartition("/")[0], []).append(R)
+        return found
 
 
 def install() -> Aspire | str:
@@ -76,31 +80,40 @@ def install() -> Aspire | str:
 def chosen(frames: int) -> tuple[NDArray[np.intp], int]:
     """Return the 60 evenly spaced frames, and how many neighbours on each side are averaged with them."""
     reach = max((frames // IMAGES - 1) // 2, 0)
-    return np.round(np.linspace(reach, frames - 1 - reach, IMAGES)).astype(np.intp), reach
+    return np.round(np.linspace(reach, frames - 1 - reach, min(IMAGES, frames))).astype(np.intp), reach
 
 
-def _images(stack: Stack, frames: Images) -> dict[str, Images]:
-    """Return centred squares about the object of each chosen frame and of the mean of its neighbours."""
+def squares(frames: Images, center: Array, pixel_size: float, radius: float) -> dict[str, Images]:
+    """Return centred squares about the object: of single frames, and of means of their neighbours.
+
+    Parameters
+    ----------
+    frames:
+        ``(N, H, W)`` attenuation.
+    center:
+        ``(N, 2)`` true centres [length].
+    radius:
+        Of the object [length].
+    """
     index, reach = chosen(len(frames))
-    around = np.arange(-reach, reach + 1)
-    windows = [
-        np.stack([_centred(stack, frames[i], stack.truth.center[i]) for i in n + around]) for n in index
-    ]
-    return {
-        "single": np.stack([window[reach] for window in windows]).astype(np.float32),
-        "averaged": np.stack([window.mean(axis=0) for window in windows]).astype(np.float32),
-    }
+    half = min(int(np.ceil(radius / pixel_size / _MASK / 2)), frames.shape[1] // 2, frames.shape[2] // 2)
+    windows = np.array(
+        [
+            [_centred(frames[i], center[i] / pixel_size, half) for i in range(n - reach, n + reach + 1)]
+            for n in index
+        ],
+        np.float32,
+    )
+    return {"single": windows[:, reach], "averaged": windows.mean(axis=1)}
 
 
-def _centred(stack: Stack, image: Images, center: Array) -> Array:
+def _centred(image: Images, shift: Array, half: int) -> Array:
     """Move the true centre to the middle pixel by a Fourier shift, which leaves white noise white; crop."""
     height, width = image.shape
-    shift = center / stack.pixel_size
     wave1, wave2 = (
         np.exp(2j * np.pi * np.fft.fftfreq(size) * s) for size, s in zip((width, height), shift, strict=True)
     )
     moved = np.fft.ifft2(np.fft.fft2(image) * wave2[:, None] * wave1).real
-    half = min(int(np.ceil(stack.radius / stack.pixel_size / _MASK / 2)), width // 2, height // 2)
     rows, columns = slice(height // 2 - half, height // 2 + half), slice(width // 2 - half, width // 2 + half)
     return np.asarray(moved[rows, columns])
 

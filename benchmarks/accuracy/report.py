@@ -5,77 +5,85 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+
+matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
+from peers import REQUIREMENT, SETTINGS
+from scenes import CURVES, NOISE, ROWS, Curve, Row, scene
 
 COLUMNS = {
     "auto": "`auto`",
     "paper": "`paper`",
     "CLSync3N/single": "CLSync3N",
-    "CLSync3N/averaged": "CLSync3N, averaged",
     "CLSyncVoting/single": "CLSyncVoting",
+    "CLSync3N/averaged": "CLSync3N, averaged",
     "CLSyncVoting/averaged": "CLSyncVoting, averaged",
 }
 COLORS = {"auto": "#0060b0", "paper": "#d86000", "CLSync3N": "#2a9030", "CLSyncVoting": "#9040a0"}
 LINEAR = 20.0  # degrees beyond which a bound, which takes angles for small, says nothing
+QUANTITIES = {"T": "T", "phi": "φ", "omega_3": "ω₃", "alpha": "α", "R": "R"}
+BETTER = 0.01  # noise at which ASPIRE is compared with
+
+Result = dict[str, Any]
 
 
-def write_figure(results: dict[str, Any], path: Path) -> None:
-    """Draw error against noise, one panel a scene."""
-    scenes = results["scenes"].values()
-    figure, axes = plt.subplots(1, len(scenes), figsize=(4.4 * len(scenes), 4.9), sharey=True, squeeze=False)
-    for axis, scene in zip(axes[0], scenes, strict=True):
-        _panel(axis, scene, np.array(results["noise"]))
+def write_figure(results: Result, path: Path) -> None:
+    """Draw error against noise, one panel a curve."""
+    curves = [curve for curve in CURVES if _seeds(results, curve.key)]
+    if not curves:
+        return
+    figure, axes = plt.subplots(1, len(curves), figsize=(5.4 * len(curves), 5.2), sharey=True, squeeze=False)
+    for axis, curve in zip(axes[0], curves, strict=True):
+        _panel(axis, results, curve)
     axes[0, 0].set_ylabel("rotation error [degrees]")
-    figure.legend(handles=_legend(), loc="lower center", ncol=5, frameon=False, fontsize=8.5)
-    figure.tight_layout(rect=(0, 0.1, 1, 1))
-    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.legend(handles=_legend(), loc="lower center", ncol=4, frameon=False, fontsize=8.5)
+    figure.tight_layout(rect=(0, 0.11, 1, 1))
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
 
-def write_page(results: dict[str, Any], path: Path) -> None:
+def write_page(results: Result, path: Path) -> None:
     """Write the tables, what they mean and how they are made."""
-    text = [_introduction(results)]
-    for scene in results["scenes"].values():
-        text += [_heading(scene), _table(scene, results["noise"]), _bound_text(scene["bound"])]
-    text.append(_how(results))
-    path.write_text("\n\n".join(text) + "\n")
+    curves = [_curve(results, curve) for curve in CURVES if _seeds(results, curve.key)]
+    parts = [_INTRODUCTION, _rows(results), _calibration(results), _NOISE, *curves, _BOUND, _how(results)]
+    path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
 
 
 # ---------------------------------------------------------------------- figure
 
 
-def _panel(axis: Axes, scene: dict[str, Any], noise: np.ndarray) -> None:
+def _panel(axis: Axes, results: Result, curve: Curve) -> None:
+    noise = np.array(NOISE)
+    bound = _mean_bound(results, curve.key)
     for kind, style in (("mean", "--"), ("worst", ":")):
-        bound = scene["bound"][kind] * noise / 0.01
-        axis.plot(100 * noise[bound < LINEAR], bound[bound < LINEAR], style, color="black", lw=1.2)
+        expected = bound[kind] * noise / 0.01
+        axis.plot(100 * noise[expected < LINEAR], expected[expected < LINEAR], style, color="black", lw=1.2)
     for method in COLUMNS:
         name, _, source = method.partition("/")
         color, line = COLORS[name], "--" if source == "averaged" else "-"
-        values = {n: _average(scene, n, method) for n in noise if _average(scene, n, method)}
-        if not values:
+        averages = {n: _average(_runs(results, curve, n, method)) for n in NOISE}
+        known = {n: average for n, average in averages.items() if average}
+        if not known:
             continue
-        x = 100 * np.array(list(values))
-        mean, worst, trusted = (np.array(v) for v in zip(*values.values(), strict=True))
+        x = 100 * np.array(list(known))
+        mean, worst, trusted = (np.array(v) for v in zip(*known.values(), strict=True))
         axis.plot(x, mean, line, color=color, lw=2.2 if name == "auto" else 1.4, zorder=3)
-        for vouched, fill in ((True, color), (False, "white")):
-            chosen = trusted == vouched
+        for share, fill in ((True, color), (False, "white")):
+            chosen = (trusted == 1) == share
             axis.plot(x[chosen], mean[chosen], "o", color=color, mfc=fill, ms=5, zorder=4)
         if not source:
             axis.plot(x, worst, line, color=color, lw=0.8, alpha=0.6)
     axis.set(xscale="log", yscale="log", xlabel="noise [% of the peak attenuation]")
-    axis.set_ylim(3e-3, 200)
+    axis.set_ylim(5e-3, 200)
     axis.set_xticks(100 * noise, [f"{100 * n:g}" for n in noise], fontsize=8.5)
     axis.minorticks_off()
     axis.set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
     axis.grid(color="0.9")
-    frames, height, width = scene["shape"]
-    axis.set_title(
-        f"{scene['title']}\n{frames} frames of {height} × {width}, {scene['turn']:.0f}°", fontsize=9.5
-    )
+    axis.set_title(curve.title, fontsize=9.5)
 
 
 def _legend() -> list[Line2D]:
@@ -92,139 +100,205 @@ def _legend() -> list[Line2D]:
         line("ASPIRE CLSync3N, mean", "-", COLORS["CLSync3N"], marker="o", ms=5),
         line("ASPIRE CLSyncVoting, mean", "-", COLORS["CLSyncVoting"], marker="o", ms=5),
         line("ASPIRE on averaged frames", "--", "0.4"),
-        line("hollow: the program itself does not trust it", "", "0.4", marker="o", mfc="white", ms=5),
+        line("hollow: exit code 4 for some seeds", "", "0.4", marker="o", mfc="white", ms=5),
     ]
 
 
-def _average(scene: dict[str, Any], noise: float, method: str) -> tuple[float, float, bool] | None:
-    """Return the mean error, the worst error of all seeds, and whether all are trusted; None without any."""
-    runs = scene["errors"].get(f"{noise:g}", {}).get(method, [])
-    known = [r for r in runs if r["mean"] is not None]
-    if not known:
+# --------------------------------------------------------------------- numbers
+
+
+def _seeds(results: Result, name: str) -> list[int]:
+    """Return the seeds for which there are runs."""
+    return sorted({int(key.split("/")[1]) for key in results["runs"] if key.split("/")[0] == name})
+
+
+def _runs(results: Result, curve: Curve, noise: float, method: str) -> list[Result]:
+    keys = [f"{curve.key}/{seed}/{noise:g}/{method}" for seed in _seeds(results, curve.key)]
+    return [results["runs"][key] for key in keys if key in results["runs"]]
+
+
+def _average(runs: list[Result]) -> tuple[float, float, float] | None:
+    """Return the mean error, the worst of all, and the share that is trusted, where all have rotations."""
+    if not runs or any(run["mean"] is None for run in runs):
         return None
     return (
-        float(np.mean([r["mean"] for r in known])),
-        max(r["worst"] for r in known),
-        all(r["trusted"] for r in known),
+        float(np.mean([run["mean"] for run in runs])),
+        max(run["worst"] for run in runs),
+        float(np.mean([run.get("trusted", True) for run in runs])),
     )
 
 
-# ------------------------------------------------------------------------ page
-
-
-def _introduction(results: dict[str, Any]) -> str:
-    seeds, aspire = results["seeds"], results["aspire"]
-    averaged = f", of {seeds} noise realisations" if seeds > 1 else ""
-    peers = (
-        f"""ASPIRE-Python {aspire["version"]} (`CLSync3N`, `CLSyncVoting`), which knows no time, gets 60
-evenly spaced of the same frames, shifted by their true centres, cropped to the object and with no search for
-shifts; once as single frames, once averaged with their neighbours, like the class averages that it is made
-for. It runs with {_settings(aspire["settings"])}, and its defaults for all else. Of several
-settings the one with the least true error counts. Once its mean error is above 60° it is not run at more
-noise."""
-        if not aspire["missing"]
-        else f"ASPIRE-Python is left out: {aspire['missing']}."
-    )
-    return f"""# Rotation error against noise
-
-![Rotation error against noise, three scenes](images/accuracy.png)
-
-Errors are angles in degrees between the rotation found and the true one, after the best constant rotation of
-the object and the better of the two mirror solutions: **mean over the frames / worst frame**{averaged}. Noise
-is white, in percent of the highest attenuation of the stack. `auto` and `paper` are the two methods of
-`trap-motion estimate`; they get the frames and their times, nothing else.
-
-{peers}
-
-† the program itself says that the result is not to be trusted. – no rotation for at least half of the frames.
-Empty: not run."""
-
-
-def _settings(settings: list[list[int]]) -> str:
-    sizes = sorted({size for size, _ in settings}, reverse=True)
-    thetas = sorted({n for _, n in settings})
-    return (
-        f"images of at most {' and '.join(str(s) for s in sizes)} pixels "
-        f"and `n_theta` {' and '.join(str(n) for n in thetas)}"
-    )
-
-
-def _heading(scene: dict[str, Any]) -> str:
-    frames, height, width = scene["shape"]
-    title = scene["title"][0].upper() + scene["title"][1:]
-    return (
-        f"## {title}\n\n{frames} frames of {height} × {width}, turned by {scene['turn']:.0f}° in all. "
-        f"Averaged: means of {scene['averaged']} frames."
-    )
-
-
-def _table(scene: dict[str, Any], noise: list[float]) -> str:
-    present = [m for m in COLUMNS if any(m in runs for runs in scene["errors"].values())]
-    rows = [
-        "| noise | Cramér–Rao bound | " + " | ".join(COLUMNS[m] for m in present) + " |",
-        "|---" * (len(present) + 2) + "|",
-    ]
-    for n in noise:
-        bound = [scene["bound"][kind] * n / 0.01 for kind in ("mean", "worst")]
-        cells = [_cell(scene, n, m) for m in present]
-        stated = f"{_digits(bound[0])} / {_digits(bound[1])}" if bound[0] < LINEAR else "–"
-        rows.append(f"| {100 * n:g} % | {stated} | " + " | ".join(cells) + " |")
-    return "\n".join(rows)
-
-
-def _cell(scene: dict[str, Any], noise: float, method: str) -> str:
-    if method not in scene["errors"].get(f"{noise:g}", {}):
-        return ""
-    average = _average(scene, noise, method)
-    if average is None:
-        return "–"
-    mean, worst, trusted = average
-    return f"{_digits(mean)} / {_digits(worst)}{'' if trusted else ' †'}"
+def _mean_bound(results: Result, name: str) -> dict[str, float]:
+    bounds = [results["bounds"][f"{name}/{seed}"] for seed in _seeds(results, name)]
+    return {kind: float(np.mean([bound[kind] for bound in bounds])) for kind in ("mean", "worst")}
 
 
 def _digits(value: float) -> str:
     return f"{value:.3f}" if value < 0.1 else f"{value:.2f}" if value < 10 else f"{value:.0f}"
 
 
-def _bound_text(bound: dict[str, Any]) -> str:
-    change = {name: f"{100 * (value - 1):+.0f} %" for name, value in bound["factor"].items()}
-    return f"""The bound: spatial frequencies up to {bound["band"]:g} over the object's radius (up to
-{bound["band"] - 4:g}: {change["band_lower_by_4"]}); an unknown object of {bound["unknowns"]} amplitudes;
-a spline of {bound["intervals"]} intervals (half as many: {change["knots_half_as_many"]}; twice as many:
-{change["knots_twice_as_many"]}). The faint prior of the object is weighted as at 0.1 % of noise
-(as at 10 %: {change["prior_at_noise_10_percent"]})."""
+# ------------------------------------------------------------------------ page
 
 
-def _how(results: dict[str, Any]) -> str:
-    machine = dict(results["machine"])
-    processor = machine.pop("processor")
-    versions = ", ".join(f"{name} {value}" for name, value in machine.items())
-    command = "python benchmarks/accuracy/run.py" + (" --quick" if results["quick"] else "")
-    if results["seeds"] > 1:
-        command += f" --seeds {results['seeds']}"
-    difference = (
-        """This is the quick version;
-without `--quick` the paper's scene has 1000 frames of 256 × 256, the bound a wider band, and ASPIRE the best
-of four settings."""
-        if results["quick"]
-        else """With `--quick`
-the paper's scene is smaller, the bound's band narrower, and ASPIRE has one setting."""
+def _rows(results: Result) -> str:
+    lines = [
+        "| stack | aimed at | measured | within the aim | over the bound | trusted | s |",
+        "|---|---|---|---|---|---|---|",
+        *(_row(results, row) for row in ROWS),
+    ]
+    return "\n".join(lines)
+
+
+def _row(results: Result, row: Row) -> str:
+    aim = f"{row.mean:g}°" + (f" ({row.worst:g}°)" if row.worst else "")
+    seeds = _seeds(results, row.key)
+    if not seeds:
+        return f"| {row.title} | {aim} | not run | | | | |"
+    runs = [results["runs"][f"{row.key}/{seed}/auto"] for seed in seeds]
+    known = [run for run in runs if run["mean"] is not None]
+    means = sorted(run["mean"] for run in known)
+    measured = "no rotation"
+    if known:
+        several = f"{_digits(means[0])}–" if len(known) > 1 else ""
+        measured = f"{several}{_digits(means[-1])}° ({_digits(max(run['worst'] for run in known))}°)"
+    within = [run for run in known if run["mean"] <= row.mean and run["worst"] <= (row.worst or np.inf)]
+    ratios = [_ratio(results, row, seed) for seed in seeds]
+    over = np.median([ratio for ratio in ratios if ratio is not None]) if known else np.nan
+    trusted = sum(bool(run.get("trusted")) for run in runs)
+    seconds = np.median([run["seconds"] for run in runs if "seconds" in run])
+    return (
+        f"| {row.title} | {aim} | {measured} | {len(within)} of {len(runs)} | {over:.1f} "
+        f"| {trusted} of {len(runs)} | {seconds:.0f} |"
     )
-    return f"""## The bound
 
-No unbiased estimate of a path of this smoothness is better on average than the Cramér–Rao bound: the inverse
-of the Fisher information of the path's spline in white noise, at the true object and motion, with the object
-inside its ball and every frame's shift unknown. It is proportional to the noise. An estimate that assumes
-more, such as a smoother path, can come out below it. The expected mean and worst error are those of draws
-from its covariance, after the same alignment.
 
-## How to repeat
+def _ratio(results: Result, row: Row, seed: int) -> float | None:
+    """Return the mean error in units of the bound's."""
+    bound = results["bounds"].get(f"{row.key}/{seed}")
+    mean = results["runs"][f"{row.key}/{seed}/auto"]["mean"]
+    return mean / (bound["mean"] * bound["noise"] / 0.01) if bound and mean is not None else None
+
+
+def _calibration(results: Result) -> str:
+    """Say how many errors are within the stated ones, over all runs of `auto` that are trusted."""
+    shares = {
+        name: np.array(
+            [run["coverage"][name] for run in results["runs"].values() if name in run.get("coverage", {})
+             and run.get("trusted") and run["method"] == "auto"]
+        )
+        for name in QUANTITIES
+    }  # fmt: skip
+    if not any(len(share) for share in shares.values()):
+        return ""
+    lines = ["| share of errors | " + " | ".join(QUANTITIES.values()) + " |", "|---" * 6 + "|"]
+    for place, text in ((0, "within 1 σ (68 %)"), (1, "within 2 σ (95 %)")):
+        cells = [f"{100 * share[:, place].mean():.0f} %" for share in shares.values()]
+        lines.append(f"| {text} | " + " | ".join(cells) + " |")
+    runs = len(next(iter(shares.values())))
+    return (
+        f"Do the stated errors come true? Over the valid frames of all {runs} results of `auto` on this page "
+        "that are trusted:\n\n" + "\n".join(lines)
+    )
+
+
+def _curve(results: Result, curve: Curve) -> str:
+    seeds = _seeds(results, curve.key)
+    made = scene(curve.table, 0).config.stack
+    present = [m for m in COLUMNS if any(_runs(results, curve, n, m) for n in NOISE)]
+    lines = [
+        f"### {curve.title}",
+        "",
+        f"{made.frames} frames of {made.height} × {made.width}; {len(seeds)} seeds of object, motion, noise.",
+        "",
+        "| noise | Cramér–Rao bound | " + " | ".join(COLUMNS[m] for m in present) + " |",
+        "|---" * (len(present) + 2) + "|",
+    ]
+    bound = _mean_bound(results, curve.key)
+    for noise in NOISE:
+        mean, worst = (bound[kind] * noise / 0.01 for kind in ("mean", "worst"))
+        stated = f"{_digits(mean)} / {_digits(worst)}" if mean < LINEAR else "–"
+        cells = [_cell(_runs(results, curve, noise, method)) for method in present]
+        lines.append(f"| {100 * noise:g} % | {stated} | " + " | ".join(cells) + " |")
+    return "\n".join([*lines, *_better(results, curve)])
+
+
+def _cell(runs: list[Result]) -> str:
+    if not runs:
+        return ""
+    average = _average(runs)
+    if average is None:
+        return f"– ({sum(run['mean'] is None for run in runs)} of {len(runs)})"
+    mean, worst, trusted = average
+    doubted = "" if trusted == 1 else f" †{round(len(runs) * (1 - trusted))}"
+    return f"{_digits(mean)} / {_digits(worst)}{doubted}"
+
+
+def _better(results: Result, curve: Curve) -> list[str]:
+    """Say by how much `auto` is better than the best of ASPIRE, on ASPIRE's frames."""
+    ours = _runs(results, curve, BETTER, "auto")
+    theirs = [_average(_runs(results, curve, BETTER, m)) for m in COLUMNS if "/" in m]
+    best = min((average[0] for average in theirs if average), default=None)
+    if best is None or not ours or any(run.get("mean_of_60") is None for run in ours):
+        return []
+    mean = float(np.mean([run["mean_of_60"] for run in ours]))
+    return [
+        "",
+        f"At {100 * BETTER:g} % the best of ASPIRE's is {_digits(best)}° off on its 60 frames; `auto`, which "
+        f"has seen all, is {_digits(mean)}° off on the same 60: {best / mean:.0f} times less.",
+    ]
+
+
+_INTRODUCTION = """# Accuracy
+
+Errors are angles in degrees between the rotation found and the true one, after the best constant rotation of
+the object and the better of the two mirror solutions: the mean over all frames and, in brackets or after a
+stroke, the worst frame. `trap-motion estimate` gets the frames, with their frame interval and pixel size,
+and nothing else; no empty field in particular. Noise is white, in percent of the highest attenuation, or
+that of a camera: shot noise, read noise, 16 and 8 bits by turns, uneven light, dust, flicker. Objects,
+motions and noise are random, another for every seed; with the camera, blobs and grains by turns.
+
+“Over the bound” is the mean error in units of the [Cramér–Rao bound](#the-bound), the median where there are
+several seeds. “Trusted”: exit code 0."""
+
+_NOISE = f"""## Error against noise
+
+![Rotation error against noise for both methods of trap-motion and two of ASPIRE-Python, with the Cramér–Rao
+bound](images/accuracy.png)
+
+Mean over the frames and over the seeds / worst frame of all seeds. †n: in n seeds the program says that the
+result is not to be trusted. – (n of m): in n of m seeds there is no rotation for at least half of the frames.
+Empty: not run.
+
+`CLSync3N` and `CLSyncVoting` of ASPIRE-Python ({REQUIREMENT.split("==")[1]}), which know no time, get 60
+evenly spaced of the same frames, shifted by their true centres, cropped to the object and with no search for
+shifts; once as single frames, once averaged with their neighbours, like the class averages that they are made
+for. They run with {" and with ".join(f"at most {s}² pixels and `n_theta` {n}" for s, n in SETTINGS)};
+the better one by true error counts. Once the mean error is above 60° they are not run at more noise."""
+
+_BOUND = """## The bound
+
+No unbiased estimate is better on average than the Cramér–Rao bound: the inverse of the Fisher information in
+white noise, at the true object and motion, of everything that is unknown. Unknown are the object, which may
+be anything inside its ball up to spatial frequencies of 20 over its radius, two shifts of every frame, and
+ω(t), a cubic spline with the fewest equal intervals that hold the true motion to a tenth of the bound. That
+many an estimate can't know beforehand. The bound is proportional to the noise; the expected mean and worst
+error are those of draws from its covariance. With a camera, the noise is the root mean square over the
+object, and the empty field is taken to be known. It is computed from exact projections, without the code of
+the estimate, and a test holds it against differences of pixels."""
+
+
+def _how(results: Result) -> str:
+    origins = sorted({(r["commit"], r["machine"]) for r in results["runs"].values() if "commit" in r})
+    commits = ", ".join(dict.fromkeys(commit for commit, _ in origins))
+    machines = "; ".join(dict.fromkeys(machine for _, machine in origins))
+    return f"""## How to repeat
 
 ```
-{command}
+python benchmarks/accuracy/run.py NAME … --seeds 0:4
 ```
 
-It installs ASPIRE into `benchmarks/accuracy/.venv-aspire`, took {results["minutes"]:.0f} minutes here, and
-writes `benchmarks/accuracy/results.json`, this page and its figure. {difference}
+NAME is one of {", ".join(f"`{each.key}`" for each in (*CURVES, *ROWS))}, in the order of this page;
+without one all are run. It installs ASPIRE into `benchmarks/accuracy/.venv-aspire` and writes
+`benchmarks/accuracy/results.json`, which holds the verdict of every run, this page and its figure.
 
-Machine: {processor}. Versions: {versions}."""
+Measured at commit {commits} on {machines}; times are those of a machine that had other work as well."""

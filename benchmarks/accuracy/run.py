@@ -1,8 +1,10 @@
 """Rotation error against noise: both methods of trap-motion, ASPIRE-Python, and the Cramér–Rao bound.
 
-python benchmarks/accuracy/run.py [--quick] [--seeds N]
+python benchmarks/accuracy/run.py [NAME ...] [--seeds 0:3] [--method auto] [--again]
 
-Writes benchmarks/accuracy/results.json, docs/images/accuracy.png and docs/benchmarks-accuracy.md.
+NAME is a curve or a row of `scenes`; without one all are measured. Curves are measured with all methods, rows
+with `auto`. What results.json holds already is not measured again. Writes benchmarks/accuracy/results.json, docs/images/accuracy.png and
+docs/benchmarks-accuracy.md.
 """
 
 from __future__ import annotations
@@ -14,199 +16,200 @@ import platform
 import subprocess
 import sys
 import time as clock
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bound import bounds
+from bound import bound, information, visible_radius
 from numpy.typing import NDArray
-from peers import INPUTS, METHODS, QUICK_SETTINGS, SETTINGS, Aspire, chosen, install
+from peers import INPUTS, METHODS, Aspire, chosen, install, squares
 from report import write_figure, write_page
-from scenes import Images, Stack, render, scenes
+from scenes import CURVES, NOISE, ROWS, Table, noise_of, scene
 
-from trapcli.config import MotionConfig
-from trapcli.motion.joint import estimate_joint
-from trapcli.motion.paper import estimate_paper
+import trapcli
+from trapcli.errors import InputError
 from trapcli.motion.path import align
+from trapcli.result.comparison import compare
 from trapcli.result.motion import Motion
+from trapcli.simulation.render import Scene
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
+Result = dict[str, Any]
 
-NOISE = (0.001, 0.003, 0.01, 0.03, 0.05, 0.1, 0.2, 0.5)
 ENOUGH = 0.5  # share of the frames that must have a rotation for an error to be stated
 LOST = 60.0  # mean error [degrees] beyond which ASPIRE is not run at more noise
+PEERS = tuple(f"{method}/{name}" for name in INPUTS for method in METHODS)
+ALL = ("paper", "auto", *PEERS)
+QUANTITIES = ("T", "phi", "omega_3", "alpha", "R")
 
 FOLDER = Path(__file__).parent
 RESULTS = FOLDER / "results.json"
 ROOT = FOLDER.parent.parent
 
 
-@dataclass(frozen=True)
-class Error:
-    """What one method made of one noisy stack.
-
-    Attributes
-    ----------
-    mean, worst:
-        Over the frames [degrees], gauge and mirror removed; None where there is no rotation to judge.
-    known:
-        Share of the frames that have a rotation.
-    trusted:
-        Whether the program itself vouches for the result.
-    seconds:
-        Time taken; None where it was not taken alone.
-    note:
-        What the program says of the result.
-    """
-
-    mean: float | None
-    worst: float | None
-    known: float = 1.0
-    trusted: bool = True
-    seconds: float | None = None
-    note: str = ""
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--quick", action="store_true", help="a smaller paper's scene, one setting of ASPIRE")
-    parser.add_argument("--seeds", type=int, default=1, help="noise realisations per noise level")
+    names = [c.key for c in CURVES] + [r.key for r in ROWS]
+    parser.add_argument("name", nargs="*", choices=[*names, []], help="curves and rows; none: all")
+    parser.add_argument("--seeds", default="0:1", metavar="A:B", help="seeds A to B − 1 of each")
+    parser.add_argument("--method", nargs="*", metavar="M", choices=ALL, default=ALL, help=", ".join(ALL))
+    parser.add_argument("--again", action="store_true", help="measure anew what has been measured")
     parser.add_argument("--report", action="store_true", help="only draw and write what results.json holds")
     options = parser.parse_args()
+    results: Result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"bounds": {}, "runs": {}}
     if not options.report:
-        _measure(options.quick, options.seeds)
-    results = json.loads(RESULTS.read_text())
+        first, last = (int(seed) for seed in options.seeds.split(":"))
+        for name in options.name or names:
+            for seed in range(first, last):
+                _measure(results, name, seed, options.method, options.again)
     write_figure(results, ROOT / "docs" / "images" / "accuracy.png")
     write_page(results, ROOT / "docs" / "benchmarks-accuracy.md")
 
 
-def _measure(quick: bool, seeds: int) -> None:
-    """Run everything; results are written after every noise level."""
-    start = clock.perf_counter()
-    aspire = install()
-    results: dict[str, Any] = {
-        "quick": quick,
-        "seeds": seeds,
-        "noise": list(NOISE),
-        "aspire": {
-            "version": None,
-            "settings": QUICK_SETTINGS if quick else SETTINGS,
-            "missing": aspire if isinstance(aspire, str) else None,
-        },
-        "machine": _machine(),
-        "scenes": {},
-    }
-    for scene in scenes(quick):
-        stack = render(scene)
-        _tell(f"{scene.key}: bound")
-        entry: dict[str, Any] = {
-            "title": scene.title,
-            "shape": list(stack.clean.shape),
-            "pixel_size": stack.pixel_size,
-            "radius": stack.radius,
-            "turn": float(np.rad2deg(stack.turn)),
-            "averaged": 2 * chosen(len(stack.clean))[1] + 1,
-            "bound": bounds(stack, quick),
-            "errors": {},
+def _measure(results: Result, name: str, seed: int, methods: list[str], again: bool) -> None:
+    """Measure a curve or a row."""
+    row = next((r for r in ROWS if r.key == name), None)
+    if row is not None:
+        _bound(results, row.table(seed), name, seed)
+        _stack(results, f"{name}/{seed}", row.table(seed), seed, [m for m in methods if m == "auto"], again)
+        return
+    curve = next(c for c in CURVES if c.key == name)
+    _bound(results, curve.table, name, seed)
+    lost: set[str] = set()
+    for noise in NOISE:
+        place = f"{name}/{seed}/{noise:g}"
+        _stack(results, place, curve.at(noise), seed, [m for m in methods if m not in lost], again)
+        lost |= {m for m in PEERS if _is_lost(results["runs"].get(f"{place}/{m}"))}
+
+
+def _stack(results: Result, place: str, table: Table, seed: int, methods: list[str], again: bool) -> None:
+    """Run methods on one stack; results are written after every run."""
+
+    def keep(found: dict[str, Result]) -> None:
+        for method, result in found.items():
+            results["runs"][f"{place}/{method}"] = result
+            print(f"{place}/{method}: {_words(result)}", file=sys.stderr, flush=True)
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+
+    missing = [m for m in methods if again or f"{place}/{m}" not in results["runs"]]
+    if missing:
+        found = scene(table, seed)
+        frames = replace(Frames.from_array(found.frames().to_array()), info=found.frames().info)
+        for method in missing:
+            if method not in PEERS:
+                keep({method: _own(method, found, frames)})
+        keep(_aspire([m for m in missing if m in PEERS], found, frames))
+
+
+def _bound(results: Result, table: Table, name: str, seed: int) -> None:
+    """Compute the bound of a scene for noise of one per cent."""
+    key = f"{name}/{seed}"
+    if key not in results["bounds"]:
+        start = clock.perf_counter()
+        found = scene(table, seed)
+        told = information(found)
+        results["bounds"][key] = {
+            **asdict(bound(found, told)),
+            "unknowns": told.unknowns,
+            "noise": noise_of(found),
+            "seconds": round(clock.perf_counter() - start, 1),
         }
-        results["scenes"][scene.key] = entry
-        lost: set[str] = set()
-        for noise in NOISE:
-            runs: dict[str, list[Error]] = {}
-            for seed in range(seeds):
-                frames = stack.noisy(noise, seed)
-                for method, error in _all_methods(stack, frames, aspire, lost, results["aspire"]):
-                    runs.setdefault(method, []).append(error)
-                    _tell(f"{scene.key}, noise {100 * noise:g} %, seed {seed}, {method}: {_words(error)}")
-            lost |= {
-                method for method, errors in runs.items() if "/" in method and _mean(errors, LOST) >= LOST
-            }
-            entry["errors"][f"{noise:g}"] = {
-                method: [asdict(e) for e in errors] for method, errors in runs.items()
-            }
-            results["minutes"] = (clock.perf_counter() - start) / 60
-            RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 
-def _all_methods(
-    stack: Stack, frames: Images, aspire: Aspire | str, lost: set[str], about: dict[str, Any]
-) -> Iterator[tuple[str, Error]]:
-    yield "paper", _own(estimate_paper, stack, frames)
-    yield "auto", _own(estimate_joint, stack, frames)
-    # both methods of ASPIRE share their common lines: a stack is left out where both are lost
-    inputs = tuple(i for i in INPUTS if not all(f"{m}/{i}" in lost for m in METHODS))
-    if isinstance(aspire, str) or not inputs:
-        return
-    try:
-        found, about["version"] = aspire.estimate(stack, frames, about["settings"], inputs)
-    except RuntimeError as error:
-        _tell(str(error))
-        return
-    truth = stack.truth.R[chosen(len(frames))[0]]
-    for name in (f"{m}/{i}" for i in inputs for m in METHODS):
-        if name not in lost:
-            errors = [_error(R, truth) for R in found.get(name, [])]
-            yield name, min(errors, key=lambda e: e.mean or 0.0, default=Error(None, None, known=0.0))
-
-
-def _own(estimate: Callable[..., Motion], stack: Stack, frames: Images) -> Error:
+def _own(method: str, scene: Scene, frames: Frames) -> Result:
+    """Run a method of trap-motion as a user would; the empty field of a camera is not given."""
     start = clock.perf_counter()
-    motion = estimate(
-        Frames.from_array(frames), MotionConfig(), time=stack.truth.time, pixel_size=stack.pixel_size
-    )
-    return _error(
-        motion.R,
-        stack.truth.R,
-        trusted=motion.identifiable,
-        seconds=round(clock.perf_counter() - start, 2),
-        note=motion.verdict,
-    )
+    attenuation = scene.config.camera.output == "attenuation"
+    try:
+        motion = trapcli.estimate(frames, method=method, attenuation=attenuation)
+    except InputError as error:
+        return {**_error(np.full((len(frames), 3, 3), np.nan), scene), "verdict": str(error), **_origin()}
+    seconds = clock.perf_counter() - start
+    index, _ = chosen(len(frames))
+    return {
+        **_error(motion.R, scene),
+        "mean_of_60": _error(motion.R[index], scene, index)["mean"],
+        "method": method,
+        "trusted": motion.identifiable,
+        "verdict": motion.verdict,
+        "valid": float(motion.valid.mean()),
+        "coverage": _coverage(motion, scene),
+        "seconds": round(seconds, 1),
+        **_origin(),
+    }
 
 
-def _error(R: Array, truth: Array, **details: Any) -> Error:
+def _aspire(methods: list[str], scene: Scene, frames: Frames) -> dict[str, Result]:
+    """Run ASPIRE's methods on 60 of the frames, given the true centres."""
+    if not methods:
+        return {}
+    aspire = install()
+    if not isinstance(aspire, Aspire):
+        print(aspire, file=sys.stderr)
+        return {}
+    truth = scene.truth()
+    index, _ = chosen(len(frames))
+    radius, pixel_size = visible_radius(scene), scene.config.stack.pixel_size
+    images = squares(frames.to_array(), truth.center, pixel_size, radius)
+    # both methods share their common lines
+    found = aspire.rotations({name: images[name] for name in INPUTS if any(name in m for m in methods)})
+    unknown = {"mean": None, "worst": None, "known": 0.0}
+    return {
+        method: min((_error(R, scene, index) for R in found.get(method, [])), key=_mean, default=unknown)
+        for method in methods
+    }
+
+
+def _is_lost(found: Result | None) -> bool:
+    return found is not None and _mean(found) > LOST
+
+
+def _mean(found: Result) -> float:
+    return 180.0 if found["mean"] is None else float(found["mean"])
+
+
+def _error(R: Array, scene: Scene, index: NDArray[np.intp] | None = None) -> Result:
+    """Return mean and largest angle over the frames [degrees], gauge and mirror removed."""
+    truth = scene.truth().R if index is None else scene.truth().R[index]
     known = np.isfinite(R).all(axis=(1, 2))
-    share = round(float(known.mean()), 4)
-    if share < ENOUGH:
-        return Error(None, None, known=share, **details)
+    if known.mean() < ENOUGH:
+        return {"mean": None, "worst": None, "known": float(known.mean())}
     angles = np.rad2deg(align(R[known], truth[known])[0])
-    return Error(float(angles.mean()), float(angles.max()), known=share, **details)
+    return {"mean": float(angles.mean()), "worst": float(angles.max()), "known": float(known.mean())}
 
 
-def _mean(errors: list[Error], unknown: float) -> float:
-    return float(np.mean([unknown if e.mean is None else e.mean for e in errors]))
+def _coverage(motion: Motion, scene: Scene) -> dict[str, tuple[float, float]]:
+    """Return the shares of errors within one and two of the stated ones, over the valid frames."""
+    errors = compare(motion, scene.truth()).errors
+    shares = {name: (errors[name].within_1_sigma, errors[name].within_2_sigma) for name in QUANTITIES}
+    return {name: share for name, share in shares.items() if np.isfinite(share).all()}
 
 
-def _words(error: Error) -> str:
-    if error.mean is None or error.worst is None:
-        return "no rotation"
-    took = "" if error.seconds is None else f", {error.seconds:.0f} s"
-    return f"{error.mean:.3f}°, worst {error.worst:.3f}°{took}{'' if error.trusted else ', not trusted'}"
+def _words(found: Result) -> str:
+    if found["mean"] is None:
+        return f"no rotation; {found.get('verdict', '')}"
+    took = f", {found['seconds']:.0f} s; {found['verdict']}" if "seconds" in found else ""
+    return f"{found['mean']:.3f}°, worst {found['worst']:.3f}°{took}"
 
 
-def _tell(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def _machine() -> dict[str, str]:
-    """Say what the measurement ran on."""
+def _origin() -> dict[str, str]:
+    """Say which program was measured, and on what."""
+    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or "unknown"
     processor = platform.processor() or platform.machine()
     information = Path("/proc/cpuinfo")
     if information.exists():
         lines = information.read_text().splitlines()
         processor = next((x.split(":")[1].strip() for x in lines if x.startswith("model name")), processor)
-    git = subprocess.run(
-        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
-    )
-    threads = os.environ.get("OMP_NUM_THREADS", "unset")
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "finufft"))
+    threads = os.environ.get("OMP_NUM_THREADS", "all")
     return {
-        "processor": f"{processor}, {os.cpu_count()} cores, OMP_NUM_THREADS {threads}",
-        "python": platform.python_version(),
-        "trapcli": version("trapcli") + (f" ({git.stdout.strip()})" if git.returncode == 0 else ""),
-        **{name: version(name) for name in ("numpy", "scipy", "finufft")},
+        "commit": commit,
+        "machine": f"{processor}, {threads} threads, Python {platform.python_version()}, {versions}",
     }
 
 

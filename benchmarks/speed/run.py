@@ -206,16 +206,19 @@ def _run(command: list[str], accepted: tuple[int, ...] = (0,)) -> tuple[str, flo
 def _aspire() -> dict[str, Any]:
     """Time CLSync3N on 60 frames of the paper's object, in the environment of benchmarks/accuracy."""
     sys.path.append(str(FOLDER.parent / "accuracy"))
-    from peers import QUICK_SETTINGS, install
-    from scenes import render, scenes
+    from bound import visible_radius
+    from peers import REQUIREMENT, SETTINGS, install, squares
+    from scenes import ROWS, scene
 
     found = install()
     if isinstance(found, str):
         return {"missing": found}
-    stack = render(scenes(True)[0])
+    stack = {"frames": 300, "height": 128, "width": 128, "pixel_size": _FIELD / 128}
+    made = scene({**ROWS[0].table(0), "stack": stack, "camera": {"noise": 0.0}}, 0)
+    images = squares(made.frames().to_array(), made.truth().center, _FIELD / 128, visible_radius(made))
     start = clock.perf_counter()
-    _, aspire_version = found.estimate(stack, stack.clean, QUICK_SETTINGS, ("single",))
-    return {"version": aspire_version, "seconds": clock.perf_counter() - start}
+    found.rotations({"single": images["single"]}, SETTINGS[1:])
+    return {"version": REQUIREMENT.split("==")[1], "seconds": clock.perf_counter() - start}
 
 
 def _processor() -> str:
