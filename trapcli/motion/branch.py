@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from trapcli.motion.common_line import LineTable, choose_pairs
 from trapcli.motion.moments import MomentTable
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _PAIRS = 12  # pairs of frames a frame
+_SUPPORT = 4  # basis functions of a cubic spline that overlap
 _DISTINCT = np.deg2rad(3.0)  # mean angle between paths that are hypotheses of their own
 _REACH = 10  # groups added at each end at a time
 _SHORT = 120  # groups up to which every refinement takes the whole path
@@ -57,13 +58,14 @@ class Evidence:
             self.time[start:stop], self.lines.select(start, stop), self.moments.select(start, stop), self.seed
         )
 
+    @cached_property
     def pairs(self) -> tuple[Index, Index]:
-        """Return the pairs of groups that are compared."""
+        """The pairs of groups that are compared."""
         return choose_pairs(len(self.time), _PAIRS, self.seed)
 
     def judge(self, path: Path) -> Hypothesis:
         """Return the path with its cost."""
-        s, t = self.pairs()
+        s, t = self.pairs
         lines, moments = self.lines.cost(path.R, s, t).sum(), self.moments.cost(path.R)
         per_pair = lines / (len(s) * self.lines.degrees)
         degrees = max(7 * len(self.time) - 16, 1)
@@ -101,24 +103,42 @@ class Evidence:
 
     def _normal_equations(self, path: Path, values: Array) -> tuple[Array, Array]:
         """Return Hessian and downhill gradient by the spline's coefficients."""
-        s, t = self.pairs()
+        s, t = self.pairs
         lines = self.lines.residuals(path.R, s, t)
-        groups = len(values)
         scale = self._scale(len(s))
-        bend = sparse.kron(sparse.csr_array(values), np.eye(3), format="csr")
-        ends = np.stack([s, s, s, t, t, t], axis=1) * 3 + [0, 1, 2, 0, 1, 2]
-        rows, columns = np.broadcast_arrays(ends[:, :, None], ends[:, None, :])
-        coupled = sparse.coo_array(
-            (scale * lines.hessian.ravel(), (rows.ravel(), columns.ravel())), shape=(3 * groups, 3 * groups)
-        ).tocsr()
-        gradient = np.asarray(np.bincount(ends.ravel(), scale * lines.gradient.ravel(), 3 * groups), float)
-        hessian = (bend.T @ (coupled @ bend)).toarray()
+        groups, size = values.shape
+        own = np.zeros((groups, 3, 3))
+        np.add.at(own, s, scale * lines.hessian[:, :3, :3])
+        np.add.at(own, t, scale * lines.hessian[:, 3:, 3:])
+        gradient = np.zeros((groups, 3))
+        np.add.at(gradient, s, scale * lines.gradient[:, :3])
+        np.add.at(gradient, t, scale * lines.gradient[:, 3:])
+        eliminated = np.zeros((3 * size, 3 * size))
         for order in self.moments.residuals(path.R):
-            gradient += order.gradient.ravel()
-            slopes = sparse.block_diag(list(order.slopes), format="csr") @ bend
-            coupling = order.design.reshape(-1, order.design.shape[-1]).T @ slopes
-            hessian += (slopes.T @ slopes).toarray() - coupling.T @ np.linalg.solve(order.normal, coupling)
-        return hessian, bend.T @ gradient
+            gradient += order.gradient
+            own += np.swapaxes(order.slopes, 1, 2) @ order.slopes
+            coupling = np.swapaxes(order.design, 1, 2) @ order.slopes
+            bent = np.einsum("gb,gui->ubi", values, coupling, optimize=True).reshape(-1, 3 * size)
+            eliminated += bent.T @ np.linalg.solve(order.normal, bent)
+        every = np.arange(groups)
+        across = _bent(values, s, t, scale * lines.hessian[:, :3, 3:])
+        hessian = _bent(values, every, every, own) + across + across.T - eliminated
+        return hessian, (values.T @ gradient).ravel()
+
+
+def _bent(values: Array, s: Index, t: Index, blocks: Array) -> Array:
+    """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(3 · size, 3 · size)``, for ``(P, 3, 3)`` blocks."""
+    size = values.shape[1]
+    # at most four of the basis functions, consecutive ones, are not 0 at a time
+    first = np.minimum(np.argmax(values != 0, axis=1), size - _SUPPORT)
+    places = first[:, None] + np.arange(_SUPPORT)
+    local = np.take_along_axis(values, places, axis=1)
+    rows = 3 * places[s][:, :, None] + np.arange(3)
+    columns = 3 * places[t][:, :, None] + np.arange(3)
+    flat = rows[:, :, :, None, None] * (3 * size) + columns[:, None, None]
+    products = np.einsum("pb,pij,pc->pbicj", local[s], blocks, local[t], optimize=True)
+    total = np.bincount(flat.ravel(), products.ravel(), (3 * size) ** 2)
+    return np.asarray(total.reshape(3 * size, 3 * size), float)
 
 
 def find_branches(

@@ -19,7 +19,7 @@ from trapcli.motion.branch import Evidence, Hypothesis, find_branches
 from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
-from trapcli.motion.low_band import LowBand
+from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Path, Spline, align
@@ -34,7 +34,7 @@ Bools = NDArray[np.bool_]
 _FEWEST = 12  # frames
 _LINE_BAND = 8.0  # band times radius for common lines
 _COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
-_FINE_BAND = 16.0  # band times radius of the object model in the end
+_FINE_BAND = 22.0  # band times radius of the object model in the end
 _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
 _FINE_GROUP = np.deg2rad(1.0)  # the same, to refine it, at noise of 1 % of the peak
 _FEWEST_GROUPS = 30
@@ -178,10 +178,9 @@ def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float
 def _grouped(stack: Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
     """Return means over groups of `size` consecutive used frames."""
     low = stack.low.select(used).grouped(size)
-    groups = len(low.time)
-    samples = stack.reduced.samples[used[: groups * size]]
-    mean = samples.reshape(groups, size, *samples.shape[1:]).mean(axis=1)
-    return replace(stack.reduced, samples=mean, time=low.time, noise=stack.reduced.noise / np.sqrt(size)), low
+    mean = group_means(stack.reduced.samples[used], len(low.time))
+    noise = stack.reduced.noise * np.sqrt(len(low.time) / len(used))
+    return replace(stack.reduced, samples=mean, time=low.time, noise=noise), low
 
 
 def _hypotheses(

@@ -76,21 +76,22 @@ class LowBand:
         )
 
     def grouped(self, size: int) -> LowBand:
-        """Return means over groups of `size` consecutive frames; a last, shorter group is left out."""
-        groups = len(self.time) // size
+        """Return means over groups of `size` consecutive frames, or a few more, so that none is left out."""
+        groups = max(1, len(self.time) // size)
+        average = len(self.time) / groups
 
         def mean(series: NDArray[Any]) -> NDArray[Any]:
-            return np.asarray(series[: groups * size].reshape(groups, size, *series.shape[1:]).mean(axis=1))
+            return group_means(series, groups)
 
         return replace(
             self,
             time=mean(self.time),
             modes=mean(self.modes),
-            variance=self.variance / size,
+            variance=self.variance / average,
             second=mean(self.second),
             third=mean(self.third),
-            second_covariance=self.second_covariance / size,
-            third_covariance=self.third_covariance / size,
+            second_covariance=self.second_covariance / average,
+            third_covariance=self.third_covariance / average,
             mass=mean(self.mass),
         )
 
@@ -243,6 +244,13 @@ class LowBandReader:
             mass=mass,
             radius=self._radius,
         )
+
+
+def group_means(series: NDArray[Any], groups: int) -> NDArray[Any]:
+    """Return ``(groups, ...)`` means over consecutive parts of ``(N, ...)``, as equal in length as can be."""
+    start = np.arange(groups + 1) * len(series) // groups
+    length = np.diff(start).reshape(-1, *[1] * (series.ndim - 1))
+    return np.asarray(np.add.reduceat(series, start[:-1], axis=0) / length)
 
 
 def _narrowed(moments: Array, spread: float) -> Array:

@@ -1,10 +1,12 @@
 """A low-frequency model of the object, eliminated exactly: the likelihood of a motion.
 
-The object is a sum of Gaussian blobs on a cubic lattice; their amplitudes enter the frames' low-frequency
-modes linearly and are solved for at every motion (variable projection; Golub and Pereyra 2003, DOI
-10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's shift is eliminated
-with them, so that centring costs nothing. All sums over frames are non-uniform Fourier transforms on the
-lattice.
+The object is a sum of Gaussian blobs on a body-centred cubic lattice, the sparsest that holds a ball of
+frequencies (Petersen and Middleton 1962, DOI 10.1016/S0019-9958(62)90633-2); their amplitudes enter the
+frames' low-frequency modes linearly and are solved for at every motion (variable projection; Golub and
+Pereyra 2003, DOI 10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's
+shift is eliminated with them, so that centring costs nothing. All sums over frames are non-uniform Fourier
+transforms on the lattice. The real part of a mode sees only the part of the object that is even about the
+centre, the imaginary part the odd one, so that the normal matrix falls into two blocks of half the size.
 """
 
 from __future__ import annotations
@@ -24,11 +26,9 @@ from trapcli.motion.roughness import Roughness
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-SPACING = 0.7
-"""Lattice spacing in units of π / band; coarser than 0.75 the lattice can't hold the band."""
-
-_MARGIN = 0.3  # lattice beyond the object's radius, in spacings
-_WIDTH = 0.4  # standard deviation of a blob in lattice spacings
+_GUARD = 6.0  # half the gap between the band and its periodic image, times the object's radius
+_MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
+_WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
 _ROUGH_PRECISION = 1e-7  # where a step is only looked for
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
@@ -120,24 +120,30 @@ class ObjectModel:
         # k = 0 is its own conjugate, every other mode stands for two
         self._share = np.where((self.low.k == 0).all(axis=1), 1.0, 2.0)
         self._root = np.sqrt(self.weights[:, None] * self._share / self.variance)
-        self.spacing = SPACING * np.pi / band
-        reach = low.radius + _MARGIN * self.spacing
+        # of a cubic lattice that repeats the spectrum as far away as the body-centred one does
+        spacing = np.pi / (band + _GUARD / low.radius)
+        self.spacing = spacing / np.sqrt(2)
+        reach = low.radius + _MARGIN * spacing
         self._half = int(reach / self.spacing)
         axis = np.arange(-self._half, self._half + 1)
         cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-        self._mask = np.linalg.norm(cube, axis=-1) * self.spacing <= reach
+        odd = cube % 2 == 1
+        centred = odd.all(axis=-1) | ~odd.any(axis=-1)
+        self._mask = centred & (np.linalg.norm(cube, axis=-1) * self.spacing <= reach)
         self._index = cube[self._mask]
         self.position = self._index * self.spacing
         radial = np.hypot(self.low.k[:, 0], self.low.k[:, 1])
-        blob = np.exp(-0.5 * (_WIDTH * self.spacing * radial) ** 2)
+        blob = np.exp(-0.5 * (_WIDTH * spacing * radial) ** 2)
         power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
         power = np.maximum(power - self.variance, 0.01 * self.variance)
         # amplitudes of unit variance then give at least the power that is seen
         self._blob = blob * np.sqrt(np.max(power / blob**2) / len(self._index))
+        # places of differences and sums of lattice points among all, for one point of each opposite pair
         edge = 4 * self._half + 1
-        flat = (self._index[:, 0] * edge + self._index[:, 1]) * edge + self._index[:, 2]
-        middle = (2 * self._half * edge + 2 * self._half) * edge + 2 * self._half
-        self._difference = flat[:, None] - flat[None, :] + middle
+        flat = self._index[: len(self._index) // 2 + 1] @ np.array([edge**2, edge, 1])
+        middle = 2 * self._half * (edge**2 + edge + 1)
+        self._difference = (flat[:, None] - flat[None, :] + middle).astype(np.int32)
+        self._sum = (flat[:, None] + flat[None, :] + middle).astype(np.int32)
 
     @property
     def data_count(self) -> float:
@@ -228,8 +234,8 @@ class ObjectModel:
         covariance = np.zeros_like(hessian)
         covariance[bent] = np.linalg.inv(known)
         parameters = float(np.sum(covariance * hessian))
-        inverse, _ = scipy.linalg.lapack.dpotri(views.factor, lower=True)
-        seen = len(inverse) - float(np.trace(inverse))
+        inverses = [scipy.linalg.lapack.dpotri(factor, lower=True)[0] for factor in views.factors]
+        seen = sum(len(inverse) - float(np.trace(inverse)) for inverse in inverses)
         degrees = max(self.data_count - seen - parameters - 2 * self.weights.sum(), 1.0)
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
@@ -251,10 +257,15 @@ class ObjectModel:
         points = slice_points(R, self.low.k, self.spacing)
         density = ((self._root * self._blob) ** 2).ravel().astype(complex)
         # the normal matrix spans ten orders of magnitude: it needs the transforms' double precision
-        kernel = back_project(points, density, 4 * self._half + 1)
-        normal = kernel.ravel()[self._difference]
-        normal[np.diag_indices(len(normal))] += 1.0
-        return _Views(R, points, normal, scipy.linalg.cholesky(normal, lower=True, check_finite=False))
+        kernel = back_project(points, density, 4 * self._half + 1).ravel()
+        across, along = kernel[self._sum], kernel[self._difference]
+        even, odd = along + across, (along - across)[:-1, :-1]
+        even[-1] *= np.sqrt(0.5)  # the point in the middle is its own opposite
+        even[:, -1] *= np.sqrt(0.5)
+        for block in (even, odd):
+            block[np.diag_indices(len(block))] += 1.0
+        factors = [scipy.linalg.cholesky(block, lower=True, check_finite=False) for block in (even, odd)]
+        return _Views(R, points, (even, odd), factors)
 
     def _right(self, views: _Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
@@ -270,9 +281,12 @@ class ObjectModel:
         return np.asarray(self._blob * values.reshape(len(amplitudes), *self._root.shape))
 
     def _cost(self, views: _Views, modes: ComplexArray) -> float:
-        right = self._right(views, self._root * modes)
-        half = scipy.linalg.solve_triangular(views.factor, right, lower=True, check_finite=False)
-        return self._square(modes) - float(half @ half)
+        parts = _folded(self._right(views, self._root * modes))
+        gains = [
+            scipy.linalg.solve_triangular(factor, part, lower=True, check_finite=False)
+            for factor, part in zip(views.factors, parts, strict=True)
+        ]
+        return self._square(modes) - float(sum(gain @ gain for gain in gains))
 
     def _state(self, views: _Views, modes: ComplexArray) -> _State:
         """Solve for the object; return what the gradient needs."""
@@ -360,8 +374,8 @@ class ObjectModel:
         root = np.linalg.cholesky(inverse)
         scale = self._blob * np.sqrt(self._share / self.variance)
         size = values.shape[1]
-        coupling = np.zeros((size, len(views.normal), 3))
-        reduced = views.normal.copy()
+        coupling = np.zeros((size, len(self.position), 3))
+        reduced = scipy.linalg.block_diag(*views.blocks)
         stack: list[Array] = []
         for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
             column = self._back_projected(rotation, slopes * (scale * np.sqrt(self.weights[g]))[:, None])
@@ -380,26 +394,44 @@ class ObjectModel:
         return np.asarray(direct - half.T @ half)
 
     def _back_projected(self, rotation: Array, modes: ComplexArray) -> Array:
-        """Return ``Re Σ_k exp(i⟨R k, b⟩) modes`` at the lattice points b, ``(n, C)`` for ``(K, C)`` modes."""
-        # the lattice is symmetric, point n − 1 − i being the mirror image of point i
-        above = len(self.position) // 2 + 1
-        phase = self.position[:above] @ (rotation[:, :2] @ self.low.k.T)
-        even, odd = np.cos(phase) @ modes.real, np.sin(phase) @ modes.imag
-        return np.concatenate([even - odd, (even + odd)[-2::-1]])
+        """Return ``Re Σ_k exp(i⟨R k, b⟩) modes`` on the lattice, folded, ``(n, C)`` for ``(K, C)`` modes."""
+        phase = self.position[: len(self.position) // 2 + 1] @ (rotation[:, :2] @ self.low.k.T)
+        even, odd = np.cos(phase) @ modes.real, -np.sin(phase[:-1]) @ modes.imag
+        even[-1] *= np.sqrt(0.5)
+        return np.asarray(np.sqrt(2) * np.concatenate([even, odd]))
 
 
 @dataclass(frozen=True)
 class _Views:
-    """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix."""
+    """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix.
+
+    The matrix is of folded amplitudes, an even block and an odd one.
+    """
 
     R: Array
     points: list[Array]
-    normal: Array
-    factor: Array
+    blocks: tuple[Array, Array]
+    factors: list[Array]
 
     def solve(self, right: Array) -> Array:
-        """Return the amplitudes for a right-hand side."""
-        return np.asarray(scipy.linalg.cho_solve((self.factor, True), right, check_finite=False))
+        """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""
+        even, odd = (
+            scipy.linalg.cho_solve((factor, True), part, check_finite=False)
+            for factor, part in zip(self.factors, _folded(right), strict=True)
+        )
+        opposite = np.sqrt(0.5) * np.stack([even[:-1] + odd, even[:-1] - odd])
+        return np.concatenate([opposite[0], even[-1:], opposite[1, ::-1]])
+
+
+def _folded(lattice: Array) -> tuple[Array, Array]:
+    """Return ``(n,)`` numbers on the lattice as their even and odd parts, normalized.
+
+    Point n − 1 − i lies opposite to point i; the one in the middle ends the even part.
+    """
+    half = len(lattice) // 2
+    first, opposite = lattice[:half], lattice[:half:-1]
+    even = np.append(np.sqrt(0.5) * (first + opposite), lattice[half])
+    return even, np.sqrt(0.5) * (first - opposite)
 
 
 def _coefficients(spline: Spline, axes: tuple[int, ...]) -> NDArray[np.intp]:
