@@ -7,6 +7,7 @@ frame. What is left is the Fisher information of the rotations, and with it that
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +20,12 @@ from trapcli.simulation.render import Scene
 
 Array = NDArray[np.float64]
 
-BAND = 20.0
+BAND = 24.0
 """Highest spatial frequency times the object's radius."""
 VISIBLE = 5e-3
 """Share of the peak attenuation at which the object ends."""
-PER_CENT = 0.01
-"""Noise, in peaks, for which bounds are stated; they are proportional to it."""
+SPREAD = 1.0
+"""How strong the object's unseen part may be: its power over that of the strongest mode that is seen."""
 
 _TURN = np.deg2rad(3.0)  # between the frames whose information is gathered
 _GATHERED = 40, 400  # fewest and most of them
@@ -32,7 +33,6 @@ _TAIL = 4.0  # of a blob that the square to be transformed holds, in standard de
 _SPACING = 0.7  # of the lattice, in units of π / band
 _MARGIN = 0.3  # lattice beyond the ball, in spacings
 _WIDTH = 0.4  # standard deviation of a blob, in spacings
-_FAINT = 1e-10  # precision of an amplitude's prior, in units of the best determined amplitude's
 _STEP = np.deg2rad(0.2)  # of the differences by rotation
 _NEGLECTED = 0.1  # share of the bound by which a spline may miss the true motion
 _DRAWS = 200
@@ -40,7 +40,7 @@ _DRAWS = 200
 
 @dataclass(frozen=True)
 class Information:
-    """What the frames of a scene tell of their rotations, for noise of one per cent of the peak.
+    """What the frames of a scene tell of their rotations.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Information:
 
 @dataclass(frozen=True)
 class Bound:
-    """Expected errors at noise of one per cent of the peak, and for which spline.
+    """Expected errors, and for which spline.
 
     Attributes
     ----------
@@ -108,8 +108,14 @@ def _design(scene: Scene, intervals: int) -> Array:
     return np.asarray(np.swapaxes(R, 1, 2) @ summed)
 
 
-def information(scene: Scene, band: float = BAND) -> Information:
-    """Gather the information of a scene in the modes up to `band` over its radius."""
+def information(scene: Scene, noises: Sequence[float], band: float = BAND) -> list[Information]:
+    """Gather the information of a scene in the modes up to `band` over its radius.
+
+    Parameters
+    ----------
+    noises:
+        Standard deviations of the noise of one pixel, in peaks.
+    """
     frames, pixel = len(scene.time), scene.config.stack.pixel_size
     parts = np.array_split(
         np.arange(frames), min(frames, np.clip(turn(scene) / _TURN, *_GATHERED).astype(int))
@@ -120,31 +126,42 @@ def information(scene: Scene, band: float = BAND) -> Information:
     lattice, width = _lattice(radius, band / radius)
     half = int(np.ceil((np.abs(lattice).max() + _TAIL * width) / pixel))
     k, kept, share = _modes(half, pixel, band / radius)
-    blob = np.sqrt(share) * np.exp(-0.5 * (width * np.hypot(*k.T)) ** 2)
+    blob = np.exp(-0.5 * (width * np.hypot(*k.T)) ** 2)
+    root = np.sqrt(share)
 
+    # a mode's real part sees the object's even part, its imaginary part the odd one
+    even = (len(lattice) + 1) // 2
     n, groups = len(lattice), len(parts)
     nuisance = np.zeros((n + 2 * groups, n + 2 * groups))
     coupling = np.zeros((n + 2 * groups, 3 * groups))
     own = np.zeros((3 * groups, 3 * groups))
+    power = np.zeros(len(k))
     for g, part in enumerate(parts):
-        weight = np.sqrt(len(part)) / (PER_CENT * scene.peak)
         model, turned = _slopes(scene, R[g], half)
-        shifted = -1j * k.T * model[kept]
-        slopes = weight * _real(np.stack([*turned[:, kept], *shifted]) * np.sqrt(share)).T
-        phase = lattice @ (R[g, :, :2] @ k.T)
-        waves = weight * _real(np.exp(-1j * phase) * blob)
-        nuisance[:n, :n] += waves @ waves.T
+        model, turned = model[kept], turned[:, kept]
+        power += np.abs(model) ** 2 / groups
+        weight = np.sqrt(len(part)) / scene.peak * root
+        slopes = (weight * np.stack([*turned, *(-1j * k.T * model)])).T
+        phase = lattice[:even] @ (R[g, :, :2] @ k.T)
+        cosine, sine = weight * blob * np.cos(phase), -weight * blob * np.sin(phase[: n - even])
+        nuisance[:even, :even] += cosine @ cosine.T
+        nuisance[even:n, even:n] += sine @ sine.T
         shift, rotation = slice(n + 2 * g, n + 2 * g + 2), slice(3 * g, 3 * g + 3)
-        product, inner = waves @ slopes, slopes.T @ slopes
-        coupling[:n, rotation], nuisance[:n, shift] = product[:, :3], product[:, 3:]
-        nuisance[shift, :n] = product[:, 3:].T
+        product = np.concatenate([cosine @ slopes.real, sine @ slopes.imag])
+        inner = (slopes.conj().T @ slopes).real
+        coupling[:n, rotation], nuisance[shift, :n] = product[:, :3], product[:, 3:].T
         nuisance[shift, shift], coupling[shift, rotation] = inner[3:, 3:], inner[3:, :3]
         own[rotation, rotation] = inner[:3, :3]
-    best = np.diag(nuisance)[:n].max()
-    nuisance[np.diag_indices(n)] += _FAINT * best
-    factor = scipy.linalg.cholesky(nuisance, lower=True, overwrite_a=True, check_finite=False)
-    lost = scipy.linalg.solve_triangular(factor, coupling, lower=True, check_finite=False)
-    return Information(frame, own - lost.T @ lost, n)
+    # of sums and differences of two amplitudes
+    variance = 2 * SPREAD * float(np.max(power / blob**2)) / n
+    found = []
+    for noise in noises:
+        known = nuisance.copy()
+        known[np.diag_indices(n)] += noise**2 / variance
+        factor = scipy.linalg.cholesky(known, lower=True, overwrite_a=True, check_finite=False)
+        lost = scipy.linalg.solve_triangular(factor, coupling, lower=True, check_finite=False)
+        found.append(Information(frame, (own - lost.T @ lost) / noise**2, n))
+    return found
 
 
 def turn(scene: Scene) -> float:
@@ -193,10 +210,6 @@ def _slopes(scene: Scene, R: Array, half: int) -> tuple[NDArray[np.complex128], 
     turns = Rotation.from_rotvec(_STEP * np.eye(3)).as_matrix()
     slopes = [(modes(R @ turn) - modes(R @ turn.T)) / (2 * _STEP) for turn in turns]
     return modes(R), np.array(slopes)
-
-
-def _real(values: NDArray[np.complex128]) -> Array:
-    return np.concatenate([values.real, values.imag], axis=-1)
 
 
 def _missed(scene: Scene, intervals: int) -> float:

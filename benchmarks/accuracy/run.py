@@ -2,9 +2,9 @@
 
 python benchmarks/accuracy/run.py [NAME ...] [--seeds 0:3] [--method auto] [--again]
 
-NAME is a curve or a row of `scenes`; without one all are measured. Curves are measured with all methods, rows
-with `auto`. What results.json holds already is not measured again. Writes benchmarks/accuracy/results.json, docs/images/accuracy.png and
-docs/benchmarks-accuracy.md.
+NAME is a curve or a row of `scenes`; without one all are measured, curves with all methods, rows with `auto`.
+What results.json holds already is not measured again. Writes benchmarks/accuracy/results.json,
+docs/images/accuracy.png and docs/benchmarks-accuracy.md.
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ def _measure(results: Result, name: str, seed: int, methods: list[str], again: b
     """Measure a curve or a row."""
     row = next((r for r in ROWS if r.key == name), None)
     if row is not None:
-        _bound(results, row.table(seed), name, seed)
+        _bounds(results, {f"{name}/{seed}": row.table(seed)}, seed)
         _stack(results, f"{name}/{seed}", row.table(seed), seed, [m for m in methods if m == "auto"], again)
         return
     curve = next(c for c in CURVES if c.key == name)
-    _bound(results, curve.table, name, seed)
+    _bounds(results, {f"{name}/{seed}/{noise:g}": curve.at(noise) for noise in NOISE}, seed)
     lost: set[str] = set()
     for noise in NOISE:
         place = f"{name}/{seed}/{noise:g}"
@@ -104,20 +104,16 @@ def _stack(results: Result, place: str, table: Table, seed: int, methods: list[s
         keep(_aspire([m for m in missing if m in PEERS], found, frames))
 
 
-def _bound(results: Result, table: Table, name: str, seed: int) -> None:
-    """Compute the bound of a scene for noise of one per cent."""
-    key = f"{name}/{seed}"
-    if key not in results["bounds"]:
-        start = clock.perf_counter()
-        found = scene(table, seed)
-        told = information(found)
-        results["bounds"][key] = {
-            **asdict(bound(found, told)),
-            "unknowns": told.unknowns,
-            "noise": noise_of(found),
-            "seconds": round(clock.perf_counter() - start, 1),
-        }
-        RESULTS.write_text(json.dumps(results, indent=1) + "\n")
+def _bounds(results: Result, tables: dict[str, Table], seed: int) -> None:
+    """Compute the bounds of stacks that differ by their noise."""
+    missing = {place: scene(table, seed) for place, table in tables.items() if place not in results["bounds"]}
+    if not missing:
+        return
+    first = next(iter(missing.values()))
+    noises = [noise_of(found) for found in missing.values()]
+    for place, noise, told in zip(missing, noises, information(first, noises), strict=True):
+        results["bounds"][place] = {**asdict(bound(first, told)), "unknowns": told.unknowns, "noise": noise}
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 
 def _own(method: str, scene: Scene, frames: Frames) -> Result:

@@ -125,6 +125,7 @@ _AXIS: Table = {
 CURVES = (
     Curve("tumbling", "Blobs that tumble by 240°", _TUMBLING),
     Curve("axis", "Blobs about one axis in the image plane, 1.2 turns of uneven speed", _AXIS),
+    Curve("paper", "The paper's object and motion, 74°", {"stack": {"frames": 200}}),
 )
 ROWS = (
     Row("paper-1", "paper's object and motion, 1000 frames of 256², 1 %", 0.04, 0.15, _paper(0.01)),

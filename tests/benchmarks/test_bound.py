@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
+import bound as bounds
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -16,12 +15,10 @@ from trapcli.motion.path import Spline, align
 from trapcli.simulation.config import MotionConfig, PhantomConfig, SimulateConfig, StackConfig
 from trapcli.simulation.render import Scene
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks" / "accuracy"))
-import bound as bounds
-
 Array = NDArray[np.float64]
 
 BAND = 6.0
+NOISE = 1e-5  # so low that what is thought of the object beforehand counts for nothing
 INTERVALS = 2
 SMALL = 1e-4
 
@@ -78,11 +75,11 @@ def by_differences(scene: Scene) -> Array:
     basis, size, _ = np.linalg.svd(nuisance, full_matrices=False)
     basis = basis[:, size > 1e-6 * size[0]]
     left = slopes - basis @ (basis.T @ slopes)
-    return left.T @ left / (bounds.PER_CENT * scene.peak) ** 2
+    return left.T @ left / (NOISE * scene.peak) ** 2
 
 
 def test_information_is_what_differences_of_pixels_give(scene: Scene) -> None:
-    found = bounds.information(scene, BAND)
+    found = bounds.information(scene, [NOISE], BAND)[0]
     np.testing.assert_array_equal(found.frame, np.arange(len(scene.time)))
     expected = by_differences(scene)
     scale = np.sqrt(np.diag(expected))
@@ -96,16 +93,15 @@ def test_information_is_what_differences_of_pixels_give(scene: Scene) -> None:
 
 def test_bound_is_the_error_of_many_small_changes_of_omega(scene: Scene) -> None:
     """Each change is integrated to rotations, and aligned as a result is."""
-    found = bounds.information(scene, BAND)
+    found = bounds.information(scene, [NOISE], BAND)[0]
     stated = bounds.bound_of_spline(scene, found, INTERVALS)
-    time = np.linspace(scene.time[0], scene.time[-1], 40 * (len(scene.time) - 1) + 1)
+    time = np.linspace(scene.time[0], scene.time[-1], 10 * (len(scene.time) - 1) + 1)
     values = Spline(time[0], time[-1], INTERVALS).values(time)
     R = scene.motion.rotations(scene.time)
-    rng = np.random.default_rng(5)
     start, free = scene.motion.omega(time), values.shape[1]
 
     def turned(coefficients: Array) -> Array:
-        return integrate_rotation(start + values @ coefficients.reshape(free, 3), time)[::40]
+        return integrate_rotation(start + values @ coefficients.reshape(free, 3), time)[::10]
 
     unit = 1e-5 * np.eye(3 * free)
     design = np.stack(
@@ -113,23 +109,33 @@ def test_bound_is_the_error_of_many_small_changes_of_omega(scene: Scene) -> None
         axis=1,
     )
     covariance = np.linalg.inv(design.T @ found.fisher @ design)
-    # a tenth of the noise, so that angles are small
-    draws = 0.1 * rng.multivariate_normal(np.zeros(3 * free), covariance, 300)
-    angles = 10 * np.rad2deg([align(turned(draw), R)[0] for draw in draws])
+    draws = np.random.default_rng(5).multivariate_normal(np.zeros(3 * free), covariance, 300)
+    angles = np.rad2deg([align(turned(draw), R)[0] for draw in draws])
     assert stated.mean == pytest.approx(angles.mean(), rel=0.1)
     assert stated.worst == pytest.approx(angles.max(axis=1).mean(), rel=0.1)
 
 
-def test_the_more_is_free_the_larger_the_bound(scene: Scene) -> None:
-    found = bounds.information(scene, BAND)
+def test_the_more_is_free_the_larger_the_bound(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = bounds.information(scene, [NOISE], BAND)[0]
     errors = [bounds.bound_of_spline(scene, found, n).mean for n in (1, 2, 4)]
     assert errors == sorted(errors)
+    errors = []
+    for spread in (0.01, 1.0, 100.0):
+        monkeypatch.setattr(bounds, "SPREAD", spread)
+        errors.append(bounds.bound_of_spline(scene, bounds.information(scene, [0.05], BAND)[0], 2).mean)
+    assert errors == sorted(errors)
+
+
+def test_noise_and_bound_are_proportional_where_the_object_is_seen(scene: Scene) -> None:
+    both = bounds.information(scene, [NOISE, 2 * NOISE], BAND)
+    errors = [bounds.bound_of_spline(scene, found, 2).mean for found in both]
+    assert errors[1] / errors[0] == pytest.approx(2.0, rel=1e-3)
 
 
 def test_the_spline_of_the_bound_holds_the_true_motion(scene: Scene) -> None:
     slow = replace(scene.config, stack=replace(scene.config.stack, frames=40))
     smooth = Scene.from_config(replace(slow, motion=MotionConfig(kind="single-axis", turns=0.4)))
-    stated = bounds.bound(smooth, bounds.information(smooth, BAND))
+    stated = bounds.bound(smooth, bounds.information(smooth, [0.01], BAND)[0])
     assert stated.intervals > 1
     assert bounds._missed(smooth, stated.intervals) < 0.1 * stated.mean
     assert bounds._missed(smooth, stated.intervals - 1) > 0.1 * stated.mean
