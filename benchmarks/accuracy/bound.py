@@ -20,7 +20,7 @@ from trapcli.simulation.render import Scene
 
 Array = NDArray[np.float64]
 
-BAND = 24.0
+BAND = 22.0
 """Highest spatial frequency times the object's radius."""
 VISIBLE = 5e-3
 """Share of the peak attenuation at which the object ends."""

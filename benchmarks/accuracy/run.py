@@ -40,7 +40,7 @@ Array = NDArray[np.float64]
 Result = dict[str, Any]
 
 ENOUGH = 0.5  # share of the frames that must have a rotation for an error to be stated
-LOST = 60.0  # mean error [degrees] beyond which ASPIRE is not run at more noise
+LOST = 15.0  # mean error [degrees] beyond which ASPIRE is not run at more noise
 PEERS = tuple(f"{method}/{name}" for name in INPUTS for method in METHODS)
 ALL = ("paper", "auto", *PEERS)
 QUANTITIES = ("T", "phi", "omega_3", "alpha", "R")
