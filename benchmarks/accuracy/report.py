@@ -130,8 +130,12 @@ def _average(runs: list[Result]) -> tuple[float, float, float] | None:
 
 
 def _mean_bound(results: Result, curve: Curve, noise: float) -> dict[str, float]:
-    bounds = [results["bounds"][f"{curve.key}/{seed}/{noise:g}"] for seed in _seeds(results, curve.key)]
-    return {kind: float(np.mean([bound[kind] for bound in bounds])) for kind in ("mean", "worst")}
+    keys = [f"{curve.key}/{seed}/{noise:g}" for seed in _seeds(results, curve.key)]
+    bounds = [results["bounds"][key] for key in keys if key in results["bounds"]]
+    return {
+        kind: float(np.mean([bound[kind] for bound in bounds])) if bounds else np.nan
+        for kind in ("mean", "worst")
+    }
 
 
 def _digits(value: float) -> str:
