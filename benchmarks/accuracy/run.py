@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time as clock
 from dataclasses import asdict, replace
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,7 @@ def main() -> None:
     options = parser.parse_args()
     results: Result = json.loads(RESULTS.read_text()) if RESULTS.exists() else {"bounds": {}, "runs": {}}
     if not options.report:
+        _origin()  # now: the working tree may change while this runs
         first, last = (int(seed) for seed in options.seeds.split(":"))
         for name in options.name or names:
             for seed in range(first, last):
@@ -192,6 +194,7 @@ def _words(found: Result) -> str:
     return f"{found['mean']:.3f}°, worst {found['worst']:.3f}°{took}"
 
 
+@cache
 def _origin() -> dict[str, str]:
     """Say which program was measured, and on what."""
     git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
