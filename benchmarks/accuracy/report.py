@@ -26,6 +26,8 @@ COLUMNS = {
 }
 COLORS = {"auto": "#0060b0", "paper": "#d86000", "CLSync3N": "#2a9030", "CLSyncVoting": "#9040a0"}
 LINEAR = 20.0  # degrees beyond which a bound, which takes angles for small, says nothing
+FIELD = "auto+field"
+"""The method that is given an image of the empty field as well."""
 QUANTITIES = {"T": "T", "phi": "φ", "omega_3": "ω₃", "alpha": "α", "R": "R"}
 BETTER = 0.01  # noise at which ASPIRE is compared with
 
@@ -147,19 +149,26 @@ def _digits(value: float) -> str:
 
 def _rows(results: Result) -> str:
     lines = [
-        "| stack | aimed at | measured | within the aim | over the bound | trusted | s |",
+        "| stack | aimed at | measured | within the aim | over the bound | trusted | processor time [s] |",
         "|---|---|---|---|---|---|---|",
-        *(_row(results, row) for row in ROWS),
+        *(
+            _row(results, row, way)
+            for row in ROWS
+            for way in (("auto", FIELD) if row.is_camera else ("auto",))
+        ),
     ]
     return "\n".join(lines)
 
 
-def _row(results: Result, row: Row) -> str:
+def _row(results: Result, row: Row, way: str) -> str:
+    title = f"{row.title}, empty field given" if way == FIELD else row.title
     aim = f"{row.mean:g}°" + (f" ({row.worst:g}°)" if row.worst else "")
-    seeds = _seeds(results, row.key)
-    if not seeds:
-        return f"| {row.title} | {aim} | not run | | | | |"
-    runs = [results["runs"][f"{row.key}/{seed}/auto"] for seed in seeds]
+    runs = {seed: results["runs"].get(f"{row.key}/{seed}/{way}") for seed in _seeds(results, row.key)}
+    runs = {seed: run for seed, run in runs.items() if run}
+    if not runs:
+        return f"| {title} | {aim} | not run | | | | |"
+    ratios = [_ratio(results, row, seed, run) for seed, run in runs.items()]
+    runs = list(runs.values())
     known = [run for run in runs if run["mean"] is not None]
     means = sorted(run["mean"] for run in known)
     measured = "no rotation"
@@ -167,43 +176,43 @@ def _row(results: Result, row: Row) -> str:
         several = f"{_digits(means[0])}–" if len(known) > 1 else ""
         measured = f"{several}{_digits(means[-1])}° ({_digits(max(run['worst'] for run in known))}°)"
     within = [run for run in known if run["mean"] <= row.mean and run["worst"] <= (row.worst or np.inf)]
-    ratios = [_ratio(results, row, seed) for seed in seeds]
     over = np.median([ratio for ratio in ratios if ratio is not None]) if known else np.nan
     trusted = sum(bool(run.get("trusted")) for run in runs)
-    seconds = np.median([run["seconds"] for run in runs if "seconds" in run])
+    seconds = [run["processor"] for run in runs if "processor" in run]
     return (
-        f"| {row.title} | {aim} | {measured} | {len(within)} of {len(runs)} | {over:.1f} "
-        f"| {trusted} of {len(runs)} | {seconds:.0f} |"
+        f"| {title} | {aim} | {measured} | {len(within)} of {len(runs)} | {over:.1f} "
+        f"| {trusted} of {len(runs)} | {np.median(seconds) if seconds else np.nan:.0f} |"
     )
 
 
-def _ratio(results: Result, row: Row, seed: int) -> float | None:
+def _ratio(results: Result, row: Row, seed: int, run: Result) -> float | None:
     """Return the mean error in units of the bound's."""
     bound = results["bounds"].get(f"{row.key}/{seed}")
-    mean = results["runs"][f"{row.key}/{seed}/auto"]["mean"]
-    return mean / bound["mean"] if bound and mean is not None else None
+    return run["mean"] / bound["mean"] if bound and run["mean"] is not None else None
 
 
 def _calibration(results: Result) -> str:
-    """Say how many errors are within the stated ones, over all runs of `auto` that are trusted."""
-    shares = {
-        name: np.array(
-            [run["coverage"][name] for run in results["runs"].values() if name in run.get("coverage", {})
-             and run.get("trusted") and run["method"] == "auto"]
-        )
-        for name in QUANTITIES
-    }  # fmt: skip
-    if not any(len(share) for share in shares.values()):
-        return ""
-    lines = ["| share of errors | " + " | ".join(QUANTITIES.values()) + " |", "|---" * 6 + "|"]
-    for place, text in ((0, "within 1 σ (68 %)"), (1, "within 2 σ (95 %)")):
-        cells = [f"{100 * share[:, place].mean():.0f} %" for share in shares.values()]
-        lines.append(f"| {text} | " + " | ".join(cells) + " |")
-    runs = len(next(iter(shares.values())))
-    return (
-        f"Do the stated errors come true? Over the valid frames of all {runs} results of `auto` on this page "
-        "that are trusted:\n\n" + "\n".join(lines)
-    )
+    """Say how many errors are within the stated ones, over the runs that are trusted."""
+    cameras = {row.key for row in ROWS if row.is_camera}
+    groups: dict[str, list[Result]] = {"attenuation": [], "camera": [], "camera, empty field given": []}
+    for key, run in results["runs"].items():
+        if run.get("trusted") and run["method"] in ("auto", FIELD):
+            camera = "camera" if key.split("/")[0] in cameras else "attenuation"
+            groups["camera, empty field given" if run["method"] == FIELD else camera].append(run["coverage"])
+    lines = [
+        "Do the stated errors come true? Shares of the errors within 1 and 2 σ, over the valid frames of all",
+        "results of `auto` on this page that are trusted; 68 and 95 % would be right.",
+        "",
+        "| frames | results | " + " | ".join(QUANTITIES.values()) + " |",
+        "|---" * (len(QUANTITIES) + 2) + "|",
+    ]
+    for name, found in groups.items():
+        shares = [np.array([run[q] for run in found if q in run]).reshape(-1, 2) for q in QUANTITIES]
+        cells = [
+            " / ".join(f"{100 * x:.0f}" for x in s.mean(axis=0)) + " %" if len(s) else "" for s in shares
+        ]
+        lines.append(f"| {name} | {len(found)} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def _curve(results: Result, curve: Curve) -> str:
@@ -309,4 +318,4 @@ NAME is one of {", ".join(f"`{each.key}`" for each in (*CURVES, *ROWS))}, in the
 without one all are run. It installs ASPIRE into `benchmarks/accuracy/.venv-aspire` and writes
 `benchmarks/accuracy/results.json`, which holds the verdict of every run, this page and its figure.
 
-Measured at commit {commits} on {machines}; times are those of a machine that had other work as well."""
+Measured at commit {commits} on {machines}."""

@@ -15,6 +15,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time as clock
 from dataclasses import asdict, replace
 from functools import cache
@@ -26,7 +27,7 @@ import numpy as np
 from bound import bound, information, visible_radius
 from numpy.typing import NDArray
 from peers import INPUTS, METHODS, Aspire, chosen, install, squares
-from report import write_figure, write_page
+from report import FIELD, write_figure, write_page
 from scenes import CURVES, NOISE, ROWS, Table, noise_of, scene
 
 import trapcli
@@ -36,6 +37,7 @@ from trapcli.result.comparison import compare
 from trapcli.result.motion import Motion
 from trapcli.simulation.render import Scene
 from trapcli.stack.frames import Frames
+from trapcli.stack.tiff import write_tiff
 
 Array = NDArray[np.float64]
 Result = dict[str, Any]
@@ -43,7 +45,7 @@ Result = dict[str, Any]
 ENOUGH = 0.5  # share of the frames that must have a rotation for an error to be stated
 LOST = 15.0  # mean error [degrees] beyond which ASPIRE is not run at more noise
 PEERS = tuple(f"{method}/{name}" for name in INPUTS for method in METHODS)
-ALL = ("paper", "auto", *PEERS)
+ALL = ("paper", "auto", FIELD, *PEERS)
 QUANTITIES = ("T", "phi", "omega_3", "alpha", "R")
 
 FOLDER = Path(__file__).parent
@@ -76,11 +78,12 @@ def _measure(results: Result, name: str, seed: int, methods: list[str], again: b
     row = next((r for r in ROWS if r.key == name), None)
     if row is not None:
         _bounds(results, {f"{name}/{seed}": row.table(seed)}, seed)
-        _stack(results, f"{name}/{seed}", row.table(seed), seed, [m for m in methods if m == "auto"], again)
+        ways = ("auto", FIELD) if row.is_camera else ("auto",)
+        _stack(results, f"{name}/{seed}", row.table(seed), seed, [m for m in methods if m in ways], again)
         return
     curve = next(c for c in CURVES if c.key == name)
     _bounds(results, {f"{name}/{seed}/{noise:g}": curve.at(noise) for noise in NOISE}, seed)
-    lost: set[str] = set()
+    lost = {FIELD}
     for noise in NOISE:
         place = f"{name}/{seed}/{noise:g}"
         _stack(results, place, curve.at(noise), seed, [m for m in methods if m not in lost], again)
@@ -119,14 +122,21 @@ def _bounds(results: Result, tables: dict[str, Table], seed: int) -> None:
 
 
 def _own(method: str, scene: Scene, frames: Frames) -> Result:
-    """Run a method of trap-motion as a user would; the empty field of a camera is not given."""
-    start = clock.perf_counter()
+    """Run a method of trap-motion as a user would."""
+    start = clock.process_time()
     attenuation = scene.config.camera.output == "attenuation"
     try:
-        motion = trapcli.estimate(frames, method=method, attenuation=attenuation)
+        with tempfile.TemporaryDirectory() as folder:
+            background = None
+            if method == FIELD:
+                background, image = f"{folder}/empty.tif", scene.background()
+                write_tiff(Path(background), [image[None]], shape=(1, *image.shape), dtype=image.dtype)
+            motion = trapcli.estimate(
+                frames, method=method.partition("+")[0], attenuation=attenuation, background=background
+            )
     except InputError as error:
         return {**_error(np.full((len(frames), 3, 3), np.nan), scene), "verdict": str(error), **_origin()}
-    seconds = clock.perf_counter() - start
+    seconds = clock.process_time() - start
     index, _ = chosen(len(frames))
     return {
         **_error(motion.R, scene),
@@ -136,7 +146,7 @@ def _own(method: str, scene: Scene, frames: Frames) -> Result:
         "verdict": motion.verdict,
         "valid": float(motion.valid.mean()),
         "coverage": _coverage(motion, scene),
-        "seconds": round(seconds, 1),
+        "processor": round(seconds, 1),
         **_origin(),
     }
 
@@ -190,7 +200,7 @@ def _coverage(motion: Motion, scene: Scene) -> dict[str, tuple[float, float]]:
 def _words(found: Result) -> str:
     if found["mean"] is None:
         return f"no rotation; {found.get('verdict', '')}"
-    took = f", {found['seconds']:.0f} s; {found['verdict']}" if "seconds" in found else ""
+    took = f", {found['processor']:.0f} s; {found['verdict']}" if "processor" in found else ""
     return f"{found['mean']:.3f}°, worst {found['worst']:.3f}°{took}"
 
 

@@ -47,6 +47,11 @@ class Row:
     table: Callable[[int], Table]
     seeds: int = 1
 
+    @property
+    def is_camera(self) -> bool:
+        """Whether the stack holds raw intensities."""
+        return self.table(0)["camera"].get("output") == "camera"
+
 
 @dataclass(frozen=True)
 class Curve:
