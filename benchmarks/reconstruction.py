@@ -318,7 +318,6 @@ def speed(frames: int = 1000, voxels: int = 128) -> str:
     case = Case.of(TUMBLING, frames=frames, size=voxels, seed=next(full_views(1)), noise=0.01)
     stack, truth = case.scene.frames(), case.truth
     rendered = case.frames  # not timed
-    before = peak_memory()
     start = clock.perf_counter()
     reconstruct(
         Frames.from_array(rendered.to_array(), stack.info), truth, pixel_size=case.pixel_size, voxels=voxels
@@ -326,9 +325,9 @@ def speed(frames: int = 1000, voxels: int = 128) -> str:
     seconds = clock.perf_counter() - start
     return (
         f"{voxels}³ voxels from {frames} frames of {voxels}²: {seconds:.0f} s on {processors()} thread"
-        f"{'s' if processors() > 1 else ''} (bar: 120 s on 2) {mark(seconds <= 120)}; the process held "
-        f"at most {peak_memory():.1f} GB, {before:.1f} GB of them before, mostly the frames. The machine's "
-        f"load was {os.getloadavg()[0]:.1f}."
+        f"{'s' if processors() > 1 else ''} (bar: 120 s on 2) {mark(seconds <= 120)}; this "
+        f"process with all its other work held at most {peak_memory():.1f} GB. The machine's load was "
+        f"{os.getloadavg()[0]:.1f}."
     )
 
 
