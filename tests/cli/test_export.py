@@ -6,6 +6,9 @@ import csv
 import dataclasses
 import io
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -113,3 +116,23 @@ def test_not_a_result(tmp_path, capfdbinary):
 def test_unknown_format(path, capfdbinary):
     assert call("export", path, "--format", "xlsx") == 2
     assert b"xlsx" in capfdbinary.readouterr().err
+
+
+def test_no_archive_on_a_terminal(path, tmp_path):
+    """A terminal shows text; the archive goes to files and pipes."""
+    script = "import sys; from trapcli.cli.main import run; run(sys.argv[1:])"
+    pty = pytest.importorskip("pty", reason="no terminals of this kind here")
+    main, terminal = pty.openpty()
+    done = subprocess.run(
+        [sys.executable, "-c", script, "export", path, "--format", "npz"],
+        stdout=terminal, stderr=subprocess.PIPE, check=False,
+    )  # fmt: skip
+    os.close(terminal)
+    os.close(main)
+    assert done.returncode == 2
+    assert b"-o" in done.stderr
+    piped = subprocess.run(
+        [sys.executable, "-c", script, "export", path, "--format", "npz"], capture_output=True, check=True
+    )
+    with np.load(io.BytesIO(piped.stdout)) as archive:
+        assert len(archive["R"]) == 2500

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -65,6 +66,8 @@ def command(
             if kind in OF_FRAMES
             else f"--format {kind}: is the same for all frames; leave out --stack and --aligned"
         )
+    if kind == "npz" and output == Path("-") and sys.stdout.isatty():
+        raise ConfigError("--format npz: is no text to read; name a file with -o")
     refuse_input(output, result, *(Path(path) for path in (stack, aligned) if path))
     motion = Motion.load(result)
     try:
