@@ -1,18 +1,230 @@
-"""From lines to directions: φ as a continuous function of time, in one of the two mirror solutions.
+"""What the images leave open: the mirror solution, and turns of the object about an axis of its symmetry.
 
 The first-order equation knows the line of direction φ, not which way it points: φ and φ + π solve it alike,
 which is the mirror ambiguity R ↔ ΣRΣ of the paper. Continuity in time leaves one choice for the whole
 series.
+
+Spin of a body of revolution about its axis can't be seen at all. A discrete symmetry can mislead as well, in
+one case: rotation about an axis n that stays in the image plane, with γ = R e₃ on a great circle. There the
+images are sinograms in planes across n. Harmonic m of their angle has no moments of an order below the amount
+of m, and its parity (Helgason–Ludwig). An object with an f-fold axis n has the harmonics 0, ±f, ±2f, …, which
+by the same conditions may be the harmonics 0, ±g, ±2g, … of another one, for g < f of the same parity: the
+one turning by θ looks like the other turning by θ f / g.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from trapcli.motion.object_model import Assessment, Fit, ObjectModel
+from trapcli.motion.path import Path
 
 Array = NDArray[np.float64]
 
 _MEMORY = 9  # reliable frames whose median the next one is compared with
+_SPIN = np.deg2rad(90.0)  # spin in the whole stack that goes unseen if the object is a body of revolution
+_SMALL_SPIN = np.deg2rad(30.0)  # spin in the whole stack by which an axis of revolution is looked for
+_WEAK = 0.3  # resistance to it, in units of that about other axes, from which on there is none
+_PLANAR = np.sin(np.deg2rad(10.0))  # distance of γ from a great circle up to which it may be on one
+_FOLDS = range(1, 9)  # symmetries of an axis that are looked for
+_SYMMETRY_FACTORS = sorted({Fraction(f, g) for f in _FOLDS for g in _FOLDS if f != g and (f - g) % 2 == 0})
+_RIVAL = 0.1  # rise of the misfit, in units of what is common, up to which another turn is refined
+_MOST_RIVALS = 4  # turns that are refined at most
+_LEAST = np.deg2rad(20.0)  # difference of two turns below which the stated errors tell
+_STEPS = 6  # of the refinement of another motion
+_SIGNIFICANT = 5.0  # standard deviations
+_MODEL_ERROR = 0.02  # share of the misfit that the object model's lattice may be worth
+_BEST_OF_MANY = 9.0  # gain of a parameter whose best of some hundred values the noise decides, 2 log 100
+
+
+@dataclass(frozen=True)
+class UnseenTurn:
+    """A turn of the object about an axis of its own of which the images don't tell how far it goes.
+
+    Attributes
+    ----------
+    axis:
+        ``(3,)`` unit vector in object coordinates.
+    turn:
+        Angle that the fitted motion turns about it [rad].
+    factors:
+        By what the turn can be multiplied, ascending, 1 among them; empty where any other turn will do.
+    """
+
+    axis: Array
+    turn: float
+    factors: tuple[Fraction, ...] = ()
+
+    @property
+    def folds(self) -> tuple[int, ...]:
+        """The object's symmetry about the axis for each of the factors; 1 for none."""
+        inverse = [1 / factor for factor in self.factors]
+        unit = np.lcm.reduce([f.denominator for f in inverse]) if inverse else 1
+        least = [int(f * int(unit)) for f in inverse]
+        common = int(np.gcd.reduce(least)) if least else 1
+        least = [fold // common for fold in least]
+        # harmonics keep their parity
+        return tuple(fold * (1 if len({f % 2 for f in least}) == 1 else 2) for fold in least)
+
+    @property
+    def text(self) -> str:
+        """What is unseen, in words."""
+        if not self.factors:
+            return (
+                "ambiguous: the object looks like a body of revolution, whose spin about its axis can't be "
+                "seen; what depends on it is not given"
+            )
+        motions = [
+            f"{abs(self.turn) * float(factor) / (2 * np.pi):.2f} turns of an object "
+            + (f"with a {fold}-fold axis" if fold > 1 else "without symmetry")
+            for factor, fold in zip(self.factors, self.folds, strict=True)
+        ]
+        return (
+            f"ambiguous: {len(motions)} motions explain the images alike, {' or '.join(motions)}, about an "
+            "axis in the image plane; alpha and R are not given"
+        )
+
+
+def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | None:
+    """Find a turn about an axis of the object that other turns could replace, by trying them.
+
+    The curvature of the misfit does not tell: where a turn is unseen the fit follows the noise into one of
+    many shallow minima.
+
+    Parameters
+    ----------
+    fit, assessment:
+        A motion that explains the images.
+    band:
+        Highest spatial frequency of the object model [rad / length].
+
+    Returns
+    -------
+    UnseenTurn or None
+        None where the images tell the motion from all others that were tried.
+    """
+    R = fit.path.R[-len(fit.low.time) :]
+    low = fit.low.shifted(np.einsum("gji,j->gi", R, assessment.middle)[:, :2])
+    centred = replace(fit, low=low)
+    # what the lower half of the band tells apart needs no finer look
+    models = [_model(centred, assessment, share * band) for share in (0.5, 1.0)]
+    rivals = _Rivals(centred, models)
+    axis = _axis_of_revolution(models[0], R, _least_resisted_axes(fit, assessment))
+    if axis is not None:
+        spin = _SPIN * (fit.path.time - fit.path.time.mean()) / np.ptp(fit.path.time)
+        # where a spin is unseen, each parameter has found the best of all values, not only of those close by
+        if rivals.as_good(_spun(fit.path, axis, spin), _BEST_OF_MANY * fit.spline.size):
+            return UnseenTurn(axis, 0.0)
+    return _other_symmetry(fit, models[0], rivals)
+
+
+def _model(fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
+    """Return the object model whose noise is what the motion leaves."""
+    inside = np.hypot(fit.low.k[:, 0], fit.low.k[:, 1]) <= band * (1 + 1e-9)
+    variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
+    return ObjectModel(fit.low, band, variance=variance[inside])
+
+
+def _least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:
+    """Return ``(3, 3)`` axes of the object as rows, that of the spin which changes the misfit least first."""
+    values = fit.spline.values(fit.low.time)
+    R = fit.path.R[-len(values) :]
+    ramp = np.linspace(-0.5, 0.5, len(values))
+    spins = [np.linalg.lstsq(values, ramp[:, None] * R[:, axis], rcond=None)[0].ravel() for axis in range(3)]
+    size = values.shape[1]
+    known = np.linalg.pinv(assessment.covariance.reshape(3 * size, 3 * size), rcond=1e-12, hermitian=True)
+    _, axes = np.linalg.eigh(np.array(spins) @ known @ np.transpose(spins))
+    return np.asarray(axes.T)
+
+
+def _axis_of_revolution(model: ObjectModel, R: Array, axes: Array) -> Array | None:
+    """Return the axis near the first of `axes` where spin is seen least, if far less than about others."""
+    least = model.cost(R, model.low.modes)
+    ramp = np.linspace(-0.5, 0.5, len(R)) * _SMALL_SPIN
+
+    def resistance(axis: Array) -> float:
+        return model.cost(_about(axis, ramp) @ R, model.low.modes) - least
+
+    def near(tangent: Array) -> Array:
+        axis = axes[0] + tangent @ axes[1:]
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    if resistance(axes[0]) > _WEAK * resistance(axes[1]):
+        return None
+    simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1.0, "maxfev": 60}
+    best = minimize(lambda x: resistance(near(x)), simplex[0], method="Nelder-Mead", options=options)
+    return near(best.x)
+
+
+def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTurn | None:
+    """Try turns in proportion to the fitted one, where it is about an axis in the image plane."""
+    gamma = fit.path.R[:, :, 2]
+    _, _, (first, _, axis) = np.linalg.svd(gamma)
+    if np.abs(gamma @ axis).max() > _PLANAR:
+        return None
+    order = np.argsort(fit.path.time, kind="stable")
+    angle = np.empty(len(gamma))
+    angle[order] = np.unwrap(np.arctan2(gamma @ np.cross(axis, first), gamma @ first)[order])
+    turned = float(np.ptp(angle))
+    factors = [factor for factor in _SYMMETRY_FACTORS if abs(factor - 1) * turned > _LEAST]
+    others = [_spun(fit.path, axis, float(factor - 1) * (angle - angle.mean())) for factor in factors]
+    groups = len(fit.low.time)
+    own = coarse.cost(fit.path.R[-groups:], coarse.low.modes)
+    rise = np.array([coarse.cost(other.R[-groups:], coarse.low.modes) - own for other in others])
+    found = [Fraction(1)]
+    for i in np.argsort(rise)[:_MOST_RIVALS]:
+        if rise[i] < max(own, _RIVAL * np.median(rise)) and rivals.as_good(others[i], fit.spline.size):
+            found.append(factors[i])
+    return UnseenTurn(axis, turned, tuple(sorted(found))) if len(found) > 1 else None
+
+
+class _Rivals:
+    """Other motions, refined and compared with the fitted one, with the lower half of the band first."""
+
+    def __init__(self, fit: Fit, models: list[ObjectModel]) -> None:
+        self._fit, self._models = fit, models
+        self._own: list[tuple[float, float]] = []
+
+    def as_good(self, path: Path, parameters: float) -> bool:
+        """Tell whether a motion explains the images as well, where the noise decides so many parameters."""
+        for i, model in enumerate(self._models):
+            if i == len(self._own):
+                self._own.append(self._refined(model, self._fit.path)[1:])
+            path, cost, degrees = self._refined(model, path)
+            own_cost, own_degrees = self._own[i]
+            free = max(abs(own_degrees - degrees), parameters)
+            allowed = free + _SIGNIFICANT * float(np.sqrt(2 * free)) + _MODEL_ERROR * own_cost
+            if cost - degrees > own_cost - own_degrees + allowed:
+                return False
+        return True
+
+    def _refined(self, model: ObjectModel, path: Path) -> tuple[Path, float, float]:
+        """Return a motion bent to fit, its misfit and the degrees of freedom that are left."""
+        fit = self._fit
+        refined = model.fit(
+            path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes, steps=_STEPS
+        )
+        return refined.path, refined.cost, model.assess(refined).degrees
+
+
+def _spun(path: Path, axis: Array, angle: Array) -> Path:
+    """Return the path with the object turned by `angle` about one of its axes in addition."""
+    order = np.argsort(path.time, kind="stable")
+    time, first = np.unique(path.time[order], return_index=True)
+    rate = CubicSpline(time, angle[order][first])(path.time, 1)
+    return Path(path.time, _about(axis, angle) @ path.R, path.omega + rate[:, None] * (axis @ path.R))
+
+
+def _about(axis: Array, angle: Array) -> Array:
+    return np.asarray(Rotation.from_rotvec(angle[:, None] * axis).as_matrix())
 
 
 def unwrap_directions(phi: Array, reliable: NDArray[np.bool_]) -> Array:

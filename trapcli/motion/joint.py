@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
+from trapcli.motion.ambiguity import unseen_turn
 from trapcli.motion.branch import Evidence, Hypothesis, find_branches
 from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
@@ -129,7 +130,9 @@ def estimate_joint(
             break
     assert best is not None
     fit, assessment = best
-    return to_motion(stack, fit, assessment, judge(fit, assessment), pixel_size)
+    verdict = judge(fit, assessment)
+    unseen = unseen_turn(fit, assessment, fine_band) if verdict.identifiable else None
+    return to_motion(stack, fit, assessment, verdict, pixel_size, unseen)
 
 
 def _outliers(low: LowBand) -> Bools:
@@ -264,7 +267,14 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
     again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
-    return again, replace(honest, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess)
+    covariance = honest.covariance
+    if fit.axes == (2,):
+        # errors out of the image plane, which the richer motion told, grow as those in the plane do
+        own, before = (np.trace(a.covariance[:, 2, :, 2]) for a in (honest, assessment))
+        covariance = assessment.covariance * max(own / before, fit.cost / assessment.degrees)
+    return again, replace(
+        honest, covariance=covariance, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess
+    )
 
 
 def _resampled(path: Path, spline: Spline, times: Array) -> Path:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from trapcli.motion.ambiguity import UnseenTurn
 from trapcli.motion.centers import Centers
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import Assessment, Fit
@@ -23,6 +24,8 @@ CERTIFIED = 1.08
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
+_COARSE = np.deg2rad(1.0)  # error of R from which on the verdict mentions it
+_TOUCHED = 0.1  # share of an unseen turn in a component of ω that makes it unknown
 
 
 @dataclass(frozen=True)
@@ -117,74 +120,134 @@ def _flags(stack: Stack) -> NDArray[np.uint16]:
     return flags
 
 
-def to_motion(stack: Stack, fit: Fit, assessment: Assessment, verdict: Verdict, pixel_size: float) -> Motion:
-    """Put the fitted path into the gauge of the result, with errors and flags."""
+def to_motion(
+    stack: Stack,
+    fit: Fit,
+    assessment: Assessment,
+    verdict: Verdict,
+    pixel_size: float,
+    unseen: UnseenTurn | None = None,
+) -> Motion:
+    """Put the fitted path into the gauge of the result, with errors and flags; leave out what is unseen."""
     time = stack.low.time
     n = len(time)
-    R, omega = fit.path.R[:n], fit.path.omega[:n]
-    R = R[0].T @ R
-    values, slopes = fit.spline.values(time), fit.spline.slopes(time)
-    R_covariance = _rotation_covariance(R, values, assessment.covariance)
-    omega_covariance = _omega_covariance(omega, values, slopes, assessment.covariance)
-    alpha = np.hypot(omega[:, 0], omega[:, 1])
-    v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
-    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
-    plane = omega_covariance[:, :2, :2]
-    alpha_errors = np.sqrt(np.einsum("ni,nij,nj->n", v, plane, v))
-    sideways = np.sqrt(np.einsum("ni,nij,nj->n", across, plane, across))
+    R = fit.path.R[0].T @ fit.path.R[:n]
+    R_covariance = _rotation_covariance(R, fit.spline.values(time), assessment.covariance)
     R_errors = np.sqrt(np.maximum(np.diagonal(R_covariance, axis1=1, axis2=2), 0.0))
-
+    rates = _rates(fit, assessment, n, unseen)
+    judged = stack.seen & (np.linalg.norm(R_errors, axis=1) <= _UNKNOWN)
     flags = _flags(stack)
-    lost = np.linalg.norm(R_errors, axis=1) > _UNKNOWN
-    faint = alpha < _FAINT * np.maximum(alpha_errors, sideways)
-    flags[faint] |= np.uint16(Flag.ALPHA_ZERO)
-    judged = stack.seen & ~lost
+    flags[rates.faint] |= np.uint16(Flag.ALPHA_ZERO)
+    flags[rates.aimless] |= np.uint16(Flag.AMBIGUOUS_PHI)
+    flags[rates.void] |= np.uint16(Flag.THIRD_ORDER_SILENT)
     valid = judged & (flags & np.uint16(Flag.OUTLIER | Flag.BLANK) == 0)
+    identifiable = verdict.identifiable and unseen is None and bool(valid.mean() > 0.5)
     text = verdict.text
-    identifiable = verdict.identifiable and bool(valid.mean() > 0.5)
-    if verdict.identifiable and not identifiable:
+    if unseen is not None:
+        text = unseen.text
+    elif verdict.identifiable and not identifiable:
         text = (
             "the images leave the rotation open by more than 20 degrees: "
             "a symmetric object, too much noise or too little rotation"
         )
+    elif identifiable and (largest := float(R_errors[valid].max())) > _COARSE:
+        text += f"; errors of the orientation reach {np.rad2deg(largest):.1f} degrees (1 sigma)"
 
-    phi = np.where(judged & ~faint, np.arctan2(omega[:, 1], omega[:, 0]), np.nan)
-    known = np.flatnonzero(np.isfinite(phi))
-    if len(known):
-        phi[known] = np.unwrap(phi[known])
-        first = phi[known[0]]
-        half_turns = np.floor(first / np.pi)
-        # an odd number of half turns is the mirror image, R → ΣRΣ
-        if half_turns % 2:
-            sigma = np.diag([1.0, 1.0, -1.0])
-            R = sigma @ R @ sigma
-        phi = phi - half_turns * np.pi
-    unknown = ~judged
+    def where_judged(values: Array) -> Array:
+        return np.where(judged, values, np.nan)
+
+    phi, mirrored = _in_gauge(where_judged(rates.phi))
+    if mirrored:
+        sigma = np.diag([1.0, 1.0, -1.0])
+        R = sigma @ R @ sigma
+    rotated = judged & (unseen is None)
     center, center_errors = _centers(stack, fit, assessment, pixel_size)
     size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
     residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
-    R_errors[unknown] = np.nan
-    R = np.where(unknown[:, None, None], np.nan, R)
     return Motion(
         time=time,
         frame=stack.frame,
         T=translation(center),
         center=center,
         phi=phi,
-        omega_3=np.where(unknown, np.nan, omega[:, 2]),
-        alpha=np.where(unknown, np.nan, alpha),
-        R=R,
+        omega_3=where_judged(rates.omega_3),
+        alpha=where_judged(rates.alpha),
+        phi_errors=where_judged(rates.phi_errors),
+        omega_3_errors=where_judged(rates.omega_3_errors),
+        alpha_errors=where_judged(rates.alpha_errors),
+        R=np.where(rotated[:, None, None], R, np.nan),
         T_errors=np.hypot(center_errors, center_errors[0]),
-        phi_errors=np.where(np.isfinite(phi), sideways / np.maximum(alpha, 1e-300), np.nan),
-        omega_3_errors=np.where(unknown, np.nan, np.sqrt(omega_covariance[:, 2, 2])),
-        alpha_errors=np.where(unknown, np.nan, alpha_errors),
-        R_errors=R_errors,
+        R_errors=np.where(rotated[:, None], R_errors, np.nan),
         valid=(valid & identifiable).astype(np.uint8),
         flags=flags,
         residual=np.where(stack.seen, residual, np.nan),
         identifiable=identifiable,
         verdict=text,
     )
+
+
+@dataclass(frozen=True)
+class _Rates:
+    """φ, ω₃, α and their errors; NaN where an unseen turn has part in them.
+
+    `faint`: α does not differ from 0; `aimless`: φ is lost to the unseen turn; `void`: α is, but φ is not.
+    """
+
+    phi: Array
+    omega_3: Array
+    alpha: Array
+    phi_errors: Array
+    omega_3_errors: Array
+    alpha_errors: Array
+    faint: Bools
+    aimless: Bools
+    void: Bools
+
+
+def _rates(fit: Fit, assessment: Assessment, n: int, unseen: UnseenTurn | None) -> _Rates:
+    time, R, omega = fit.path.time[:n], fit.path.R[:n], fit.path.omega[:n]
+    covariance = _omega_covariance(
+        omega, fit.spline.values(time), fit.spline.slopes(time), assessment.covariance
+    )
+    alpha = np.hypot(omega[:, 0], omega[:, 1])
+    v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
+    across = np.stack([-v[:, 1], v[:, 0]], axis=1)
+    alpha_errors, sideways = (
+        np.sqrt(np.einsum("ni,nij,nj->n", u, covariance[:, :2, :2], u)) for u in (v, across)
+    )
+    faint = alpha <= _FAINT * np.maximum(alpha_errors, sideways)
+    open_turn = np.zeros((n, 3)) if unseen is None else unseen.axis @ R
+    along, aside = (np.abs(np.einsum("ni,ni->n", u, open_turn[:, :2])) for u in (v, across))
+    aimless = ~faint & (aside > _TOUCHED)
+    void = np.where(faint, np.hypot(along, aside), along) > _TOUCHED
+    spun = np.abs(open_turn[:, 2]) > _TOUCHED
+
+    def known(values: Array, unknown: Bools) -> Array:
+        return np.where(unknown, np.nan, values)
+
+    return _Rates(
+        phi=known(np.arctan2(omega[:, 1], omega[:, 0]), faint | aimless),
+        omega_3=known(omega[:, 2], spun),
+        alpha=known(alpha, void),
+        phi_errors=known(sideways / np.maximum(alpha, 1e-300), faint | aimless),
+        omega_3_errors=known(np.sqrt(covariance[:, 2, 2]), spun),
+        alpha_errors=known(alpha_errors, void),
+        faint=faint,
+        aimless=aimless,
+        void=void & ~faint & ~aimless,
+    )
+
+
+def _in_gauge(phi: Array) -> tuple[Array, bool]:
+    """Return φ continuous and in [0, π) at the first frame that has one, and whether R → ΣRΣ leads there."""
+    known = np.flatnonzero(np.isfinite(phi))
+    if not len(known):
+        return phi, False
+    continuous = phi.copy()
+    continuous[known] = np.unwrap(phi[known])
+    half_turns = int(np.floor(continuous[known[0]] / np.pi))
+    # an odd number of half turns is the mirror image
+    return continuous - half_turns * np.pi, half_turns % 2 == 1
 
 
 def _centers(stack: Stack, fit: Fit, assessment: Assessment, pixel_size: float) -> tuple[Array, Array]:
