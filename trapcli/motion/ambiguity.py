@@ -29,7 +29,8 @@ from trapcli.motion.path import Path
 Array = NDArray[np.float64]
 
 _MEMORY = 9  # reliable frames whose median the next one is compared with
-_SPIN = np.deg2rad(90.0)  # spin in the whole stack that goes unseen if the object is a body of revolution
+_SPIN = 2 * np.pi  # spin in the whole stack that goes unseen if the object is a body of revolution; less may
+# go unseen because little is seen of an object that hardly turns out of the image plane
 _SMALL_SPIN = np.deg2rad(30.0)  # spin in the whole stack by which an axis of revolution is looked for
 _WEAK = 0.3  # resistance to it, in units of that about other axes, from which on there is none
 _PLANAR = np.sin(np.deg2rad(10.0))  # distance of γ from a great circle up to which it may be on one
