@@ -147,7 +147,7 @@ def volume_row(name: str, bar: float, cases: list[Case], *, resolution: bool = F
         exact = crossing(found.resolution.frequency, own, np.sqrt(2 * HALF / (1 + HALF)))
         departures.append(found.resolution.half / exact - 1)
         print(name, f"{correlation:.5f}", f"{100 * departures[-1]:+.1f} %", seconds[-1], flush=True)
-    told = f"{max(departures, key=abs):+.0%}"
+    told = f"{100 * max(departures, key=abs):+.0f} %"
     if resolution:
         told += f" {mark(max(np.abs(departures)) <= 0.15)}"
     worst = min(correlations)
@@ -193,8 +193,8 @@ def limited_view(frames: int) -> str:
     return (
         f"The paper's object and motion, {frames} frames of 128², 1 % noise, estimated motion: coverage "
         f"{100 * found.coverage.share:.2f} %, exactly {100 * exact:.2f} % ({DIRECTIONS} random directions): "
-        f"{departure:+.1%} of it (bar: 2 %) {mark(abs(departure) <= 0.02)}; the warning of a limited view is "
-        f"{'given ✓' if warned else 'missing ✗'}. What is seen of the object correlates with it by "
+        f"{100 * departure:+.1f} % of it (bar: 2 %) {mark(abs(departure) <= 0.02)}; the warning of a limited "
+        f"view is {'given ✓' if warned else 'missing ✗'}. What is seen of the object correlates with it by "
         f"{correlation:.2f}."
     )
 
@@ -344,8 +344,8 @@ def report(volumes: list[str], formats: list[str], limited: str, fast: str, seed
             "Objects known in closed form, at the voxels of what `reconstruct` makes of their frames.",
             "Noise is white, in units of the highest attenuation. Motions are estimated from the frames,",
             f"from no starting value. Of {len(seeds)} random scenes each, the worst counts. Tumbling is by",
-            f"480°, seeds {', '.join(map(str, seeds))}: the first to show at least {LIMITED:.0%} of",
-            "Fourier space.",
+            f"480°; its seeds {', '.join(map(str, seeds))} are the first that show at least",
+            f"{100 * LIMITED:.0f} % of Fourier space.",
             "",
             "## Volumes",
             "",
