@@ -102,6 +102,34 @@ def test_the_gradient_is_half_the_slope_downhill(thing: Blobs, path: Path) -> No
         assert -slope / (4 * h) == pytest.approx(np.sum(gradient[:, 3:] * shift), rel=1e-5)
 
 
+def test_misfit_and_what_the_frames_see_do_not_favour_a_motion(path: Path) -> None:
+    """Of noise alone, the object takes up less where all frames look the same way."""
+    blank, band = Blobs.random(np.random.default_rng(1), radius=RADIUS), 8 / RADIUS
+    low = low_band(blank, path, 0, band=band)
+    model = ObjectModel(low, band)
+    rng, sigma = np.random.default_rng(1), np.sqrt(low.variance)
+    noises = [sigma / np.sqrt(2) * (rng.normal(size=(2, *low.modes.shape)).T @ [1, 1j]).T for _ in range(20)]
+    for noise in noises:
+        noise[:, 0] = sigma * rng.normal(size=FRAMES)
+    biases = []
+    for R in (path.R, np.tile(np.eye(3), (FRAMES, 1, 1))):
+        views = model._views(R)
+        costs = [model._cost(views, noise) for noise in noises]
+        tolerance = 4 * np.sqrt(2 * model.data_count / len(noises))
+        assert np.mean(costs) + views.seen == pytest.approx(model.data_count, abs=tolerance)
+        biases.append(views.seen)
+    assert biases[0] > biases[1] + 2 * tolerance
+
+
+def test_the_slopes_of_what_the_frames_see(thing: Blobs, path: Path) -> None:
+    low = low_band(thing, path, 3, noise=0.05)
+    model = ObjectModel(low, BAND, weights=np.linspace(0.5, 1, FRAMES))
+    slopes, h = model._seen_slopes(model._views(path.R)), 3e-5
+    turn = np.random.default_rng(0).normal(size=(FRAMES, 3))
+    after, before = (model._views(turned(path.R, sign * h * turn)).seen for sign in (1, -1))
+    assert (after - before) / (2 * h) == pytest.approx(np.sum(slopes * turn), rel=1e-5)
+
+
 def test_the_hessian_has_object_and_shifts_eliminated(thing: Blobs, path: Path) -> None:
     """Against a dense least-squares problem: no transform on the lattice, no elimination by blocks."""
     few, band = slice(0, FRAMES, 6), 8 / RADIUS

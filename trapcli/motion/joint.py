@@ -124,7 +124,7 @@ def estimate_joint(
     refined = 0
     for found in _hypotheses(stack, used, pace, progress):
         fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
-        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost)
+        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
         refined += len(fits)
         if judge(*best).identifiable or refined >= _MOST_REFINED:
             break

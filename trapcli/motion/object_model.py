@@ -7,11 +7,16 @@ Pereyra 2003, DOI 10.1088/0266-5611/19/2/201). What remains is the misfit of the
 shift is eliminated with them, so that centring costs nothing. All sums over frames are non-uniform Fourier
 transforms on the lattice. The real part of a mode sees only the part of the object that is even about the
 centre, the imaginary part the odd one, so that the normal matrix falls into two blocks of half the size.
+
+The object follows the noise as well: on the average the misfit lacks as much as the number of amplitudes that
+the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. Both together are
+minimized; their mean over the noise does not favour motions that see more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import finufft
 import numpy as np
@@ -164,7 +169,7 @@ class ObjectModel:
         axes: tuple[int, ...] = (0, 1, 2),
         steps: int = _STEPS,
     ) -> Fit:
-        """Bend `path` to the least misfit (Gauss–Newton on the projected misfit).
+        """Bend `path` to the least unbiased misfit (Gauss–Newton on the projected misfit).
 
         Parameters
         ----------
@@ -192,6 +197,7 @@ class ObjectModel:
             shift, low = shift + moved, low.shifted(moved)
             state = self._state(views, low.modes)
             gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
+            gradient -= 0.5 * self._seen_slopes(views)
             downhill = (values.T @ gradient).ravel()[bent]
             fresh = hessian is None
             if hessian is None:
@@ -234,9 +240,7 @@ class ObjectModel:
         covariance = np.zeros_like(hessian)
         covariance[bent] = np.linalg.inv(known)
         parameters = float(np.sum(covariance * hessian))
-        inverses = [scipy.linalg.lapack.dpotri(factor, lower=True)[0] for factor in views.factors]
-        seen = sum(len(inverse) - float(np.trace(inverse)) for inverse in inverses)
-        degrees = max(self.data_count - seen - parameters - 2 * self.weights.sum(), 1.0)
+        degrees = max(self.data_count - views.seen - parameters - 2 * self.weights.sum(), 1.0)
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
             degrees=degrees,
@@ -265,7 +269,30 @@ class ObjectModel:
         for block in (even, odd):
             block[np.diag_indices(len(block))] += 1.0
         factors = [scipy.linalg.cholesky(block, lower=True, check_finite=False) for block in (even, odd)]
-        return _Views(R, points, (even, odd), factors)
+        halves = [scipy.linalg.lapack.dtrtri(factor, lower=True)[0] for factor in factors]
+        # not the trace of N⁻¹ A Aᵀ, of which rounding would leave little
+        seen = float(sum(len(half) - np.sum(half**2) for half in halves))
+        return _Views(R, points, (even, odd), factors, seen)
+
+    def _seen_slopes(self, views: _Views) -> Array:
+        """Return the ``(G, 3)`` derivatives of ``views.seen`` by small rotations ε, ``R → R exp([ε]×)``.
+
+        d tr(1 − N⁻¹) = tr(N⁻² dN), a sum over differences of lattice points.
+        """
+        even, odd = (_symmetric_inverse(factor) for factor in views.factors)
+        even, odd = even @ even, np.pad(odd @ odd, (0, 1))
+        even[-1] *= np.sqrt(0.5)
+        even[:, -1] *= np.sqrt(0.5)
+        edge = 4 * self._half + 1
+        total = np.bincount(self._difference.ravel(), (even + odd).ravel(), edge**3)
+        total += np.bincount(self._sum.ravel(), (even - odd).ravel(), edge**3)
+        cube = total.reshape(edge, edge, edge)
+        cube += cube[::-1, ::-1, ::-1]
+        place = 0.5 * self.spacing * np.arange(-2 * self._half, 2 * self._half + 1)
+        along = np.stack([cube * place[:, None, None], cube * place[:, None], cube * place])
+        slopes = project(views.points, along).imag.reshape(3, *self._root.shape)
+        turned = _turning(views.R, self.low.k, slopes * (self._root * self._blob) ** 2)
+        return np.asarray(turned.sum(axis=1))
 
     def _right(self, views: _Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
@@ -299,10 +326,8 @@ class ObjectModel:
     def _model(self, views: _Views, amplitude: Array) -> tuple[ComplexArray, ComplexArray]:
         """Return ``(G, K)`` modes and their whitened ``(G, K, 5)`` slopes by rotation and shift."""
         model, *gradient = self._waves(views, [amplitude, *(amplitude * self.position.T)])
-        g1, g2, g3 = np.einsum("gji,jgk->igk", views.R, np.array(gradient))
+        slopes = -1j * _turning(views.R, self.low.k, np.array(gradient))
         k1, k2 = self.low.k.T
-        # R → R exp([ε]×) moves the mode at R k by R (ε × k)
-        slopes = np.stack([-1j * k2 * g3, 1j * k1 * g3, -1j * (k1 * g2 - k2 * g1)], axis=-1)
         shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
         return model, np.concatenate([slopes, shifts], axis=-1) * self._root[..., None]
 
@@ -355,11 +380,11 @@ class ObjectModel:
         def rough(path: Path) -> float:
             return 0.0 if roughness is None else roughness.penalty(path, groups)
 
-        old = cost + rough(path)
+        old = cost + views.seen + rough(path)
         for _ in range(6):
             tried = path.bent(spline, step)
             seen = self._views(tried.R[-groups:])
-            gain = old - self._cost(seen, low.modes) - rough(tried)
+            gain = old - self._cost(seen, low.modes) - seen.seen - rough(tried)
             if gain > 0:
                 return gain, tried, seen
             step = step / 4
@@ -405,13 +430,15 @@ class ObjectModel:
 class _Views:
     """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix.
 
-    The matrix is of folded amplitudes, an even block and an odd one.
+    The matrix is of folded amplitudes, an even block and an odd one. `seen` is how many amplitudes the frames
+    determine.
     """
 
     R: Array
     points: list[Array]
     blocks: tuple[Array, Array]
     factors: list[Array]
+    seen: float
 
     def solve(self, right: Array) -> Array:
         """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""
@@ -421,6 +448,22 @@ class _Views:
         )
         opposite = np.sqrt(0.5) * np.stack([even[:-1] + odd, even[:-1] - odd])
         return np.concatenate([opposite[0], even[-1:], opposite[1, ::-1]])
+
+
+def _symmetric_inverse(factor: Array) -> Array:
+    """Return the inverse of a matrix from its lower Cholesky factor."""
+    lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
+    return np.asarray(lower + np.tril(lower, -1).T)
+
+
+def _turning(R: Array, k: Array, gradient: NDArray[Any]) -> NDArray[Any]:
+    """Turn ``(3, G, K)`` gradients at R Pᵀk into ``(G, K, 3)`` derivatives by ε, ``R → R exp([ε]×)``.
+
+    The mode at R Pᵀk moves by R (ε × Pᵀk).
+    """
+    g1, g2, g3 = np.einsum("gji,jgk->igk", R, gradient)
+    k1, k2 = k.T
+    return np.stack([k2 * g3, -k1 * g3, k1 * g2 - k2 * g1], axis=-1)
 
 
 def _folded(lattice: Array) -> tuple[Array, Array]:
