@@ -4,6 +4,8 @@
 
     frames ──▶ attenuation ──▶ centres ──▶ reduced map ──▶ v, ω₃ ──▶ α ──▶ R ──▶ Motion
                to_attenuation  └─────── estimate_paper or estimate_joint ───────┘
+                     ▲                                                   │
+                     └──────────── dust: find_standing_pattern ◀─────────┘
 
 Elbau, Ritsch-Marte, Scherzer and Schmutz, "Inverse problems of trapped objects", Inverse Problems 36 (2020).
 """
@@ -12,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from trapcli.config import EstimateConfig, to_toml
 from trapcli.errors import ConfigError, InputError
-from trapcli.preprocess.attenuation import to_attenuation
+from trapcli.preprocess.attenuation import GUESSED, to_attenuation
 from trapcli.result import provenance
 from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
@@ -95,9 +98,13 @@ def estimate(
     # the matrices are small and many: threads that share one spend most of their time waiting for each other
     with threadpool_limits(1, user_api="blas"):
         projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
-        motion = recover(
-            projections, config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
+        told = partial(
+            recover, config=config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
         )
+        motion = told(projections)
+        guessed = not config.preprocess.attenuation and config.preprocess.background in GUESSED
+        if guessed and config.motion.method == "auto":
+            projections, motion = _without_dust(projections, motion, told, pixel)
     origin = provenance.collect(configuration=to_toml(config))
     if warnings := _warnings(projections, config):
         origin["warnings"] = "\n".join(warnings)
@@ -121,6 +128,22 @@ def _method(name: str) -> Callable[..., Motion]:
 
         return estimate_joint
     raise ConfigError(f"--method {name}: must be auto or paper")
+
+
+def _without_dust(
+    projections: Frames, motion: Motion, recover: Callable[[Frames], Motion], pixel_size: float
+) -> tuple[Frames, Motion]:
+    """Take off what stays in place under the particle, if that explains the images better."""
+    from trapcli.preprocess.standing import find_standing_pattern, without
+
+    pattern = find_standing_pattern(projections, motion, pixel_size)
+    if pattern is None:
+        return projections, motion
+    cleared = without(projections, pattern)
+    again = recover(cleared)
+    both = np.isfinite(motion.residual) & np.isfinite(again.residual)
+    better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False
+    return (cleared, again) if better and again.identifiable >= motion.identifiable else (projections, motion)
 
 
 def _from_array(frames: Any) -> Frames:

@@ -113,3 +113,16 @@ def test_progress_is_told(paper_frames) -> None:  # type: ignore[no-untyped-def]
     frames = Frames.from_array(paper_frames[0])
     estimate_centers(frames, progress=lambda *what: told.append(what))
     assert told[-1] == ("centers", 40, 40)
+
+
+@pytest.mark.parametrize("cut", [False, True], ids=["whole", "cut"])
+def test_noise_whose_high_frequencies_a_codec_has_cut(cut: bool) -> None:
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[:128, :128] - 64
+    ball = np.exp(-(rows**2 + columns**2) / (2 * 12**2))
+    k1, k2 = np.abs(np.fft.fftfreq(128, 0.5)), np.abs(np.fft.rfftfreq(128, 0.5))
+    radial = np.hypot(k1[:, None], k2)
+    kept = 0.1 + 0.9 / (1 + (radial / 0.7) ** 16) if cut else np.ones(radial.shape)
+    noise = 0.05 * rng.standard_normal((4, 128, 128))
+    images = ball + np.fft.irfft2(np.fft.rfft2(noise) * kept, (128, 128))
+    assert pixel_noise(images) == pytest.approx(0.05, rel=0.1)

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import rfft2
+from scipy.fft import dctn, rfft2
 from scipy.ndimage import uniform_filter
+from scipy.stats import chi2
 
 from trapcli.motion.cells import Cells
 from trapcli.motion.time_derivatives import choose_filters
@@ -43,6 +44,11 @@ _OUTSIDE = 0.1  # share of the frame outside the object's disc that tells the le
 _CONVERGED = 1e-9  # step that ends the iteration [pixels]
 _FINE = 0.01  # or in units of the error that the noise makes
 _MOST_STEPS = 50
+_BLOCK = 16  # edge of the blocks in which a codec's loss is looked for [pixels]
+_FEWEST_BLOCKS = 4  # along an edge of the frame
+_EVEN = (0.2, 0.35), (0.35, 0.5)  # bands that a codec leaves as they are, in units of the highest frequency
+_ALIKE = 1.3  # ratio of the noise's power in the two
+_CUT = 1.5  # power in them, in units of that in the corners, that shows a codec at work
 
 
 @dataclass(frozen=True)
@@ -181,7 +187,7 @@ def pixel_noise(images: NDArray[Any]) -> float:
     """Return the standard deviation of white noise in ``(K, H, W)`` images.
 
     It is read off the corners of their Fourier transforms, beyond the circle that a smooth object keeps
-    inside.
+    inside; of a lossy video, whose codec has emptied the corners, off what it has left as it was.
     """
     if not len(images) or min(images.shape[1:]) < 4:
         return 0.0
@@ -193,6 +199,31 @@ def pixel_noise(images: NDArray[Any]) -> float:
         np.median(np.abs(rfft2(image * window)[corner]) ** 2) / np.log(2) / np.sum(window**2)
         for image in images
     ]
+    return max(float(np.sqrt(np.median(powers))), _uncut_noise(images))
+
+
+def _uncut_noise(images: NDArray[Any]) -> float:
+    """Return the noise below the frequencies from which on a lossy codec has cut it; 0 where none has.
+
+    Such noise is as strong up to half of the highest frequency, and falls from there on. This is looked for
+    in the quietest blocks of each image, which the empty field fills.
+    """
+    height, width = (size // _BLOCK * _BLOCK for size in images.shape[1:])
+    if min(height, width) < _FEWEST_BLOCKS * _BLOCK:
+        return 0.0
+    v, u = np.meshgrid(*2 * [np.arange(_BLOCK) / _BLOCK])
+    radial = np.hypot(u, v)
+    bands = [(radial > low) & (radial <= high) for low, high in _EVEN] + [np.minimum(u, v) > 0.7]
+    powers = []
+    for image in images:
+        blocks = image[:height, :width].reshape(height // _BLOCK, _BLOCK, width // _BLOCK, _BLOCK)
+        power = dctn(blocks.astype(float), axes=(1, 3), norm="ortho").transpose(0, 2, 1, 3) ** 2
+        means = [power[..., band].mean(axis=-1) for band in bands]
+        # among blocks of white noise, a quarter of the means of m modes lies below this share of its power
+        below = [chi2.ppf(0.25, np.count_nonzero(band)) / np.count_nonzero(band) for band in bands]
+        low, middle, corner = (np.quantile(m, 0.25) / share for m, share in zip(means, below, strict=True))
+        cut = max(low, middle) < _ALIKE * min(low, middle) and middle > _CUT * corner
+        powers.append(np.median(means[1]) if cut else 0.0)
     return float(np.sqrt(np.median(powers)))
 
 

@@ -1,0 +1,303 @@
+"""What stays in place under a particle that never leaves it, told apart once the motion is roughly known.
+
+Dust that the particle always covers adds the same b(x) to all projections. In Fourier space, about the centre
+C₂ (``eqRecMapReduced``),
+
+    J̃(t, k) = û(R(t) Pᵀk) + b̂(k) exp(i⟨k, C₂(t)⟩) + noise,
+
+linear in the object u and in b. The object is eliminated exactly; b is a sum of points, each with a prior
+variance of its own that makes the data likeliest, so that few points remain where few are needed (Tipping
+2001, Journal of Machine Learning Research 1; MacKay 1992, DOI 10.1162/neco.1992.4.3.415). What both could
+explain, a pattern that is round about the rotation's axis, is left to the object, where it does no harm. Then
+the motion is fitted to what is left, and so on, until the pattern stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from trapcli.motion.fourier_slices import back_project, slice_points
+from trapcli.motion.front_end import read_front_end
+from trapcli.motion.low_band import SQUARE, LowBand
+from trapcli.motion.object_model import ObjectModel
+from trapcli.motion.path import Path, Spline
+from trapcli.result.motion import Motion
+from trapcli.stack.frames import Frames
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_LINE_BAND = 1.0  # band times radius of the reduced map, of which nothing is used
+_BAND = 16.0  # band times radius: that of the object model which judges the motion
+_SPACING = 0.7  # of the points and of the object's lattice, in units of π / band
+_REACH = 1.1  # of both, in radii of the object
+_GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
+_FEWEST_GROUPS = 30
+_KNOTS = np.deg2rad(6.0)  # rotation per interval of the spline that bends the motion
+_FEWEST_KNOTS = 12
+_STEPS = 2  # of fitting the motion, each time
+_ROUNDS = 4  # of fitting one after the other
+_SETTLED = 0.03  # change of the pattern, as a share of it, that ends them
+_VARIANCES = np.geomspace(1e-3, 1e7, 100)  # of the points, in units of what is told best
+_SIFTINGS = 40  # of the points
+_LEAST_TOLD = 1e-3  # share of a point's variance that the frames are taken to tell at least
+_NEGLIGIBLE = 1e-6  # variance of a point, as a share of the typical, that is as good as none
+_CONVINCING = 5.0  # natural logarithm of the odds at which there is a pattern
+
+
+def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> Array | None:
+    """Find what stays in place while the particle moves.
+
+    Parameters
+    ----------
+    frames:
+        N attenuation projections.
+    motion:
+        Of the particle in them, roughly; centres in units of `pixel_size`.
+    pixel_size:
+        Edge of a pixel [length].
+
+    Returns
+    -------
+    ndarray
+        ``(H, W)`` attenuation to be taken off every frame, at the low spatial frequencies that tell the
+        motion; None where nothing stays, or where the motion isn't known.
+    """
+    known = np.flatnonzero(np.isfinite(motion.R[:, 0, 0]) & np.isfinite(motion.center[:, 0]))
+    if len(known) < _FEWEST_GROUPS:
+        return None
+    front = read_front_end(
+        frames, time=motion.time, pixel_size=pixel_size, line_band=_LINE_BAND, fine_band=_BAND
+    )
+    # the centres that the fit has found are better than those of single frames
+    low = front.low.shifted(motion.center - front.centers.center).select(known)
+    center, R, time = motion.center[known], motion.R[known], motion.time[known]
+    path = Path(time, R, R[:, 0])
+    turned = float(np.sum(np.linalg.norm(path.mean_omega(), axis=1) * np.diff(time)))
+    size = max(1, min(int(_GROUP * len(known) / turned), len(known) // _FEWEST_GROUPS))
+    views = _Views.of(low, center, size)
+    intervals = min(max(_FEWEST_KNOTS, round(turned / _KNOTS)), len(views.low.time) // 3)
+    spline = Spline(time[0], time[-1], intervals)
+    path = _along(path, spline, views.low.time)
+    points = _Points.over(low, np.median(center, axis=0))
+    odds, values = _pattern(views, path, points)
+    if odds < _CONVINCING:
+        return None
+    for _ in range(_ROUNDS):
+        model = ObjectModel(views.without(points.waves @ values), _BAND / low.radius)
+        fit = model.fit(path, views.low.time, spline, steps=_STEPS)
+        path, before = fit.path, values
+        _, values = _pattern(views.shifted(fit.shift), path, points)
+        change = np.linalg.norm(points.waves @ (values - before))
+        if change < _SETTLED * np.linalg.norm(points.waves @ values):
+            break
+    return points.image(values, frames.shape[1:], pixel_size)
+
+
+def without(frames: Frames, pattern: Array) -> Frames:
+    """Return frames less an ``(H, W)`` image, and say so in `StackInfo.warnings`."""
+    taken = pattern.astype(frames.dtype)
+
+    def read_blocks(size: int) -> Iterator[NDArray[Any]]:
+        return (block - taken for block in frames.read_blocks(size))
+
+    def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[Any]]:
+        return (image - taken for image in frames.pick(positions))
+
+    said = (
+        "something that is no part of the particle stays in place under it, like dust; up to "
+        f"{np.abs(pattern).max():.2g} of attenuation is taken off; a file of the empty field tells more"
+    )
+    info = replace(frames.info, warnings=(*frames.info.warnings, said))
+    return replace(frames, read_blocks=read_blocks, read_some=read_some, info=info)
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Low band of G groups of frames, and the ``(G, K)`` modes there of a point in the frame's middle."""
+
+    low: LowBand
+    phase: ComplexArray
+
+    @classmethod
+    def of(cls, low: LowBand, center: Array, size: int) -> _Views:
+        """Average groups of `size` frames."""
+        grouped = low.grouped(size)
+        groups = len(grouped.time)
+        phase = np.exp(1j * center[: groups * size] @ low.k.T)
+        return cls(grouped, phase.reshape(groups, size, -1).mean(axis=1))
+
+    def shifted(self, shift: Array) -> _Views:
+        """Move the centres by ``(G, 2)`` `shift`."""
+        return _Views(self.low.shifted(shift), self.phase * np.exp(1j * shift @ self.low.k.T))
+
+    def without(self, pattern: ComplexArray) -> LowBand:
+        """Return the low band without a pattern of ``(K,)`` modes."""
+        return replace(self.low, modes=self.low.modes - self.phase * pattern)
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Where there may be a pattern.
+
+    Attributes
+    ----------
+    place:
+        ``(P, 2)``, from the frame's middle [length].
+    radius:
+        Of the object [length].
+    k:
+        ``(K, 2)`` modes.
+    waves:
+        ``(K, P)`` modes of points of unit value.
+    """
+
+    place: Array
+    radius: float
+    k: Array
+    waves: ComplexArray
+
+    @classmethod
+    def over(cls, low: LowBand, middle: Array) -> _Points:
+        """Lay points, as close as the band can tell them apart, over the disc of the object."""
+        spacing, reach = _SPACING * np.pi * low.radius / _BAND, _REACH * low.radius
+        axis = np.arange(-int(reach / spacing), int(reach / spacing) + 1) * spacing
+        square = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        place = square[np.hypot(*square.T) <= reach] + middle
+        return cls(place, low.radius, low.k, np.exp(-1j * low.k @ place.T) * spacing**2 / (2 * np.pi))
+
+    def image(self, values: Array, shape: tuple[int, ...], pixel_size: float) -> Array:
+        """Return the ``(H, W)`` image that has the modes of points of these values, and no others."""
+        x1, x2 = ((np.arange(size) - size // 2) * pixel_size for size in reversed(shape))
+        across, down = np.exp(1j * np.outer(self.k[:, 0], x1)), np.exp(1j * np.outer(self.k[:, 1], x2))
+        cell = float(self.k[1] @ self.k[1]) / (2 * np.pi)
+        modes = cell * _share(self.k) * (self.waves @ values)
+        image = ((modes[:, None] * down).T @ across).real
+        # the modes are those of a square, beyond which the image repeats
+        middle = self.place.mean(axis=0)
+        near = np.hypot(x1 - middle[0], (x2 - middle[1])[:, None]) <= SQUARE * self.radius
+        return np.asarray(np.where(near, image, 0.0))
+
+
+def _share(k: Array) -> Array:
+    """Return how many modes each stands for: k = 0 is its own conjugate."""
+    return np.where((k == 0).all(axis=1), 1.0, 2.0)
+
+
+def _along(path: Path, spline: Spline, times: Array) -> Path:
+    """Return the path of the spline nearest to ω of `path` on the spline's grid, followed by `times`."""
+    middle = 0.5 * (path.time[1:] + path.time[:-1])
+    wanted = np.concatenate([spline.grid, times])
+    ascending, back = np.unique(wanted, return_inverse=True)
+    smooth = Path.smooth(spline, spline.fit(middle, path.mean_omega()), ascending)
+    return Path(wanted, smooth.R[back], smooth.omega[back])
+
+
+def _pattern(views: _Views, path: Path, points: _Points) -> tuple[float, Array]:
+    """Return the logarithm of the odds that there is a pattern, and the ``(P,)`` values of its points."""
+    told = _without_object(views, path.R[-len(views.phase) :], points)
+    # where the motion or the model is wrong, what is left over is no pattern for that alone
+    misfit = (told.square - told.likeliest().gain) / told.degrees
+    told = told.doubted(max(1.0, misfit))
+    likeliest = told.likeliest()
+    return likeliest.odds, told.sifted(likeliest.variance)
+
+
+@dataclass(frozen=True)
+class _Likeliest:
+    """The variance of all points that makes the data likeliest, its gain in misfit, and ln of its odds."""
+
+    variance: float
+    gain: float
+    odds: float
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What the frames tell of the points: ``x curvature x − 2 pull x + square`` is the misfit.
+
+    The object is eliminated; `degrees` is the misfit that noise gives.
+    """
+
+    curvature: Array
+    pull: Array
+    square: float
+    degrees: float
+
+    def doubted(self, misfit: float) -> _Told:
+        """Return the same with the noise raised by a misfit."""
+        return replace(self, curvature=self.curvature / misfit, pull=self.pull / misfit)
+
+    def likeliest(self) -> _Likeliest:
+        """Return the variance that suits all points alike."""
+        bend, turn = np.linalg.eigh(self.curvature)
+        bend, pull = np.maximum(bend, 0.0), turn.T @ self.pull
+
+        def tried(variance: float) -> _Likeliest:
+            gain = float(np.sum(pull**2 * variance / (1 + variance * bend)))
+            return _Likeliest(variance, gain, 0.5 * (gain - float(np.sum(np.log1p(variance * bend)))))
+
+        return max((tried(v) for v in _VARIANCES / bend.max()), key=lambda one: one.odds)
+
+    def sifted(self, variance: float) -> Array:
+        """Return the values of the points, each with the variance that suits it (MacKay's fixed point)."""
+        variances = np.full(len(self.pull), variance)
+        for _ in range(_SIFTINGS):
+            values, errors = self._given(variances)
+            surplus = np.maximum(1 - errors / variances, _LEAST_TOLD)
+            variances = np.maximum(values**2 / surplus, _NEGLIGIBLE * variance)
+        return self._given(variances)[0]
+
+    def _given(self, variances: Array) -> tuple[Array, Array]:
+        """Return values and squared errors of points with prior variances."""
+        root = np.sqrt(variances)
+        scaled = root[:, None] * self.curvature * root + np.eye(len(root))
+        covariance = root[:, None] * np.linalg.inv(scaled) * root
+        return covariance @ self.pull, np.diagonal(covariance)
+
+
+def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
+    """Eliminate the object."""
+    low, band = views.low, _BAND / views.low.radius
+    k, spacing = low.k, _SPACING * np.pi / band
+    weight = _share(k) / low.variance
+    half = int(_REACH * low.radius / spacing)
+    axis = np.arange(-half, half + 1)
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    inside = np.linalg.norm(cube, axis=-1) * spacing <= _REACH * low.radius
+    edge = 4 * half + 1
+    flat = cube[inside] @ np.array([edge**2, edge, 1])
+    # amplitudes of unit variance give the power that is seen
+    scale = np.sqrt(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)) / np.count_nonzero(inside))
+    density = np.tile(weight * scale**2, len(R)).astype(complex)
+    kernel = back_project(slice_points(R, k, spacing), density, edge).ravel()
+    normal = kernel[flat[:, None] - flat + kernel.size // 2]
+    normal[np.diag_indices(len(normal))] += 1.0
+    factor = scipy.linalg.cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
+
+    def gathered(modes: ComplexArray, k: Array) -> Array:
+        """Return the products of all the object's waves with ``(G, K)`` modes."""
+        everywhere = back_project(slice_points(R, k, spacing), scale * modes.ravel(), 2 * half + 1)
+        return np.asarray(everywhere[inside], float)
+
+    own = np.concatenate([points.waves.real, points.waves.imag])
+    one = [gathered(weight[j] * views.phase[:, j], k[j : j + 1]) for j in range(len(k))]
+    other = [gathered(1j * weight[j] * views.phase[:, j], k[j : j + 1]) for j in range(len(k))]
+    mixed = np.stack(one + other, axis=1) @ own
+    mixed, right = (
+        scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
+        for columns in (mixed, gathered(weight * low.modes, k))
+    )
+    power = np.tile(weight * np.sum(np.abs(views.phase) ** 2, axis=0), 2)
+    product = weight * np.sum(views.phase.conj() * low.modes, axis=0)
+    curvature = own.T @ (power[:, None] * own) - mixed.T @ mixed
+    pull = own.T @ np.concatenate([product.real, product.imag]) - mixed.T @ right
+    square = float(np.sum(weight * np.abs(low.modes) ** 2))
+    degrees = max(weight.sum() * low.variance * len(R) - len(normal) - 2 * len(R), 1.0)
+    return _Told(curvature, pull, square - float(right @ right), degrees)
