@@ -207,8 +207,12 @@ def _words(found: Result) -> str:
 @cache
 def _origin() -> dict[str, str]:
     """Say which program was measured, and on what."""
-    git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--exclude=*"]
-    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or "unknown"
+    git = ["git", "-C", str(ROOT)]
+    last = [*git, "log", "-1", "--format=%h", "--", "trapcli"]
+    changed = [*git, "status", "--porcelain", "--", "trapcli"]
+    commit, changes = (
+        subprocess.run(command, capture_output=True, text=True).stdout.strip() for command in (last, changed)
+    )
     processor = platform.processor() or platform.machine()
     information = Path("/proc/cpuinfo")
     if information.exists():
@@ -217,7 +221,7 @@ def _origin() -> dict[str, str]:
     versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "scipy", "finufft"))
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     return {
-        "commit": commit,
+        "commit": (commit or "unknown") + (", changed" if changes else ""),
         "machine": f"{processor}, {threads} threads, Python {platform.python_version()}, {versions}",
     }
 
