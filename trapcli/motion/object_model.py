@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from trapcli.motion.fourier_slices import back_project, project, slice_points
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.path import Path, Spline
+from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
 
 Array = NDArray[np.float64]
@@ -87,8 +87,6 @@ class Assessment:
         ``(G,)`` and ``(K,)`` misfit of each frame and of each mode in units of its noise.
     middle:
         ``(3,)`` centre of the object from the origin of the model, in object coordinates [length].
-    shift_errors:
-        ``(G, 2)`` 1-σ errors of the shifts for a known object [length].
     """
 
     degrees: float
@@ -96,7 +94,6 @@ class Assessment:
     frame_misfit: Array
     mode_misfit: Array
     middle: Array
-    shift_errors: Array
 
 
 class ObjectModel:
@@ -201,7 +198,7 @@ class ObjectModel:
             downhill = (values.T @ gradient).ravel()[bent]
             fresh = hessian is None
             if hessian is None:
-                curvature = self._hessian(views, state, values)
+                curvature = self._eliminated(views, state, values).hessian
                 hessian = _pinned(curvature, path.R[-groups:], values)[np.ix_(bent, bent)]
                 if roughness is not None:
                     # far from the motion the misfit is large, and must not call for wiggles
@@ -231,7 +228,7 @@ class ObjectModel:
         R = fit.path.R[-len(values) :]
         views = self._views(R)
         state = self._state(views, fit.low.modes)
-        hessian = self._hessian(views, state, values)
+        hessian = self._eliminated(views, state, values).hessian
         size = values.shape[1]
         bent = np.ix_(*2 * (_coefficients(fit.spline, fit.axes),))
         known = _pinned(hessian, R, values)[bent]
@@ -247,9 +244,73 @@ class ObjectModel:
             covariance=covariance.reshape(size, 3, size, 3),
             frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
-            middle=state.amplitude @ self.position / state.amplitude.sum(),
-            shift_errors=np.sqrt(np.diagonal(_shift_covariance(state), axis1=1, axis2=2)),
+            middle=self._middle(state),
         )
+
+    def locate(self, fit: Fit, covariance: Array, R: Array, low: LowBand) -> tuple[Array, Array]:
+        """Find the middle of the fitted object in single frames.
+
+        Parameters
+        ----------
+        fit:
+            A motion of the G groups.
+        covariance:
+            ``(size, 3, size, 3)`` of the coefficients of its spline.
+        R:
+            ``(N, 3, 3)`` rotations of N frames.
+        low:
+            Their modes, about the centres that the groups had before the fit.
+
+        Returns
+        -------
+        place, errors:
+            ``(N, 2)`` from those centres, and 1-σ errors of the way from the first frame [length].
+        """
+        values = fit.spline.values(fit.low.time)
+        views = self._views(fit.path.R[-len(values) :])
+        state = self._state(views, fit.low.modes)
+        moved = np.stack([np.interp(low.time, fit.low.time, column) for column in fit.shift.T], axis=1)
+        modes = low.modes[:, : len(self.low.k)] * np.exp(1j * moved @ self.low.k.T)
+        noise = self.variance * (low.variance / self.low.variance)
+        points = slice_points(R, self.low.k, self.spacing)
+        model, slopes = self._model(R, points, state.amplitude)
+        root = np.sqrt(self._share / noise)
+        single = _State(state.amplitude, (modes - model) * root, slopes * root[:, None], 0.0)
+        own = _shift_covariance(single)
+        down = np.einsum("gki,gk->gi", single.slopes[..., 3:].conj(), single.residual).real
+        place = moved + np.einsum("gij,gj->gi", own, down)
+        place += np.einsum("gji,j->gi", R, self._middle(state))[:, :2]
+        alone = np.diagonal(own, axis1=1, axis2=2) + np.diag(own[0])
+        alone[0] = 0.0
+        common = self._common_errors(views, state, values, covariance)
+        shared = np.stack([np.interp(low.time, fit.low.time, column) for column in common.T], axis=1)
+        return place, np.sqrt(alone + shared**2)
+
+    def _common_errors(self, views: _Views, state: _State, values: Array, covariance: Array) -> Array:
+        """Return ``(G, 2)`` errors of the way from the first group that object and motion cause [length]."""
+        eliminated = self._eliminated(views, state, values)
+        middle = self._middle(state)
+        arm = (self.position - middle) / state.amplitude.sum()
+        lever = np.stack([np.concatenate(_folded(column)) for column in arm.T], axis=1)
+        scale = self._blob * np.sqrt(self._share / self.variance)
+        flat = covariance.reshape(2 * (3 * values.shape[1],))
+        first: tuple[Array, Array] | None = None
+        errors = np.zeros((len(values), 2))
+        for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
+            column = self._back_projected(
+                rotation, slopes[:, 3:] * (scale * np.sqrt(self.weights[g]))[:, None]
+            )
+            # the centre is the shift and the middle, which follow the object and the motion
+            followed = lever @ rotation[:, :2] - column @ eliminated.shift_covariance[g]
+            by_object = scipy.linalg.solve_triangular(
+                eliminated.factor, followed, lower=True, overwrite_b=True, check_finite=False
+            )
+            turned = cross_matrix(rotation.T @ middle)[:2] - eliminated.carry[g].T
+            by_motion = np.kron(values[g], turned) - by_object.T @ eliminated.half
+            first = first or (by_object, by_motion)
+            way, turn = by_object - first[0], by_motion - first[1]
+            errors[g] = np.sum(way**2, axis=0) + np.einsum("ip,pq,iq->i", turn, flat, turn, optimize=True)
+        return np.sqrt(errors)
 
     # ------------------------------------------------------------------ one motion
 
@@ -300,12 +361,12 @@ class ObjectModel:
         lattice = back_project(views.points, waves, 2 * self._half + 1)
         return np.asarray(lattice[self._mask])
 
-    def _waves(self, views: _Views, amplitudes: list[Array]) -> ComplexArray:
+    def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
         volume = np.zeros((len(amplitudes), *self._mask.shape), complex)
         volume[:, self._mask] = amplitudes
-        values = project(views.points, volume)
-        return np.asarray(self._blob * values.reshape(len(amplitudes), *self._root.shape))
+        values = project(points, volume)
+        return np.asarray(self._blob * values.reshape(len(amplitudes), -1, len(self._blob)))
 
     def _cost(self, views: _Views, modes: ComplexArray) -> float:
         parts = _folded(self._right(views, self._root * modes))
@@ -319,17 +380,20 @@ class ObjectModel:
         """Solve for the object; return what the gradient needs."""
         right = self._right(views, self._root * modes)
         amplitude = views.solve(right)
-        model, slopes = self._model(views, amplitude)
+        model, slopes = self._model(views.R, views.points, amplitude)
         cost = self._square(modes) - float(right @ amplitude)
-        return _State(amplitude, (modes - model) * self._root, slopes, cost)
+        return _State(amplitude, (modes - model) * self._root, slopes * self._root[..., None], cost)
 
-    def _model(self, views: _Views, amplitude: Array) -> tuple[ComplexArray, ComplexArray]:
-        """Return ``(G, K)`` modes and their whitened ``(G, K, 5)`` slopes by rotation and shift."""
-        model, *gradient = self._waves(views, [amplitude, *(amplitude * self.position.T)])
-        slopes = -1j * _turning(views.R, self.low.k, np.array(gradient))
+    def _middle(self, state: _State) -> Array:
+        return np.asarray(state.amplitude @ self.position / state.amplitude.sum())
+
+    def _model(self, R: Array, points: list[Array], amplitude: Array) -> tuple[ComplexArray, ComplexArray]:
+        """Return ``(G, K)`` modes and their ``(G, K, 5)`` slopes by rotation and shift."""
+        model, *gradient = self._waves(points, [amplitude, *(amplitude * self.position.T)])
+        slopes = -1j * _turning(R, self.low.k, np.array(gradient))
         k1, k2 = self.low.k.T
         shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
-        return model, np.concatenate([slopes, shifts], axis=-1) * self._root[..., None]
+        return model, np.concatenate([slopes, shifts], axis=-1)
 
     def _shift_step(self, views: _Views, state: _State) -> Array:
         """Return the shifts that lessen the misfit most while the object follows, by conjugate gradients.
@@ -390,8 +454,8 @@ class ObjectModel:
             step = step / 4
         return 0.0, path, views
 
-    def _hessian(self, views: _Views, state: _State, values: Array) -> Array:
-        """Return half the Hessian by the spline's coefficients, object and shifts eliminated."""
+    def _eliminated(self, views: _Views, state: _State, values: Array) -> _Eliminated:
+        """Eliminate the object and the shifts from the normal equations of a motion."""
         curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
         inverse = _shift_covariance(state)
         carry = curvature[:, :3, 3:] @ inverse
@@ -416,7 +480,7 @@ class ObjectModel:
         flat = coupling.transpose(1, 0, 2).reshape(len(reduced), -1)
         half = scipy.linalg.solve_triangular(factor, flat, lower=True, overwrite_b=True, check_finite=False)
         direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
-        return np.asarray(direct - half.T @ half)
+        return _Eliminated(direct - half.T @ half, factor, half, inverse, carry)
 
     def _back_projected(self, rotation: Array, modes: ComplexArray) -> Array:
         """Return ``Re Σ_k exp(i⟨R k, b⟩) modes`` on the lattice, folded, ``(n, C)`` for ``(K, C)`` modes."""
@@ -448,6 +512,30 @@ class _Views:
         )
         opposite = np.sqrt(0.5) * np.stack([even[:-1] + odd, even[:-1] - odd])
         return np.concatenate([opposite[0], even[-1:], opposite[1, ::-1]])
+
+
+@dataclass(frozen=True)
+class _Eliminated:
+    """What eliminating the object and the shifts leaves of the normal equations, and what it took.
+
+    Attributes
+    ----------
+    hessian:
+        ``(3 · size, 3 · size)`` half the Hessian by the spline's coefficients.
+    factor:
+        ``(n, n)`` Cholesky factor of the folded object's block, the shifts eliminated.
+    half:
+        ``(n, 3 · size)`` its solution for the coupling of object and motion.
+    shift_covariance, carry:
+        ``(G, 2, 2)`` covariance of the shifts for a known object; ``(G, 3, 2)`` the coupling of rotations and
+        shifts, times it.
+    """
+
+    hessian: Array
+    factor: Array
+    half: Array
+    shift_covariance: Array
+    carry: Array
 
 
 def _symmetric_inverse(factor: Array) -> Array:

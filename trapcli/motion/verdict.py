@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from trapcli.motion.ambiguity import UnseenTurn
 from trapcli.motion.centers import Centers
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.object_model import Assessment, Fit
+from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.translation import translation
 from trapcli.motion.types import ReducedMap
 from trapcli.result.motion import Flag, Motion
@@ -52,10 +53,11 @@ class Stack:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the motion can be trusted, and why."""
+    """Whether the motion can be trusted, why, and the share of what changes that no noise explains."""
 
     identifiable: bool
     text: str
+    left: float = 0.0
 
 
 def judge(fit: Fit, assessment: Assessment) -> Verdict:
@@ -75,6 +77,7 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
             True,
             f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
             f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it",
+            error,
         )
     return Verdict(
         False,
@@ -134,7 +137,10 @@ def to_motion(
     R = fit.path.R[0].T @ fit.path.R[:n]
     R_covariance = _rotation_covariance(R, fit.spline.values(time), assessment.covariance)
     R_errors = np.sqrt(np.maximum(np.diagonal(R_covariance, axis1=1, axis2=2), 0.0))
-    rates = _rates(fit, assessment, n, unseen)
+    # what is left over might be the mark of turns that are wrong by as much, in all frames alike
+    turned = np.minimum(Rotation.from_matrix(R).magnitude(), 1.0)
+    R_errors = np.hypot(R_errors, verdict.left * turned[:, None])
+    rates = _rates(fit, assessment, n, unseen, verdict.left)
     judged = stack.seen & (np.linalg.norm(R_errors, axis=1) <= _UNKNOWN)
     flags = _flags(stack)
     flags[rates.faint] |= np.uint16(Flag.ALPHA_ZERO)
@@ -161,7 +167,7 @@ def to_motion(
         sigma = np.diag([1.0, 1.0, -1.0])
         R = sigma @ R @ sigma
     rotated = judged & (unseen is None)
-    center, center_errors = _centers(stack, fit, assessment, pixel_size)
+    center, T_errors = _centers(stack, fit, assessment)
     size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
     residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
     return Motion(
@@ -176,7 +182,7 @@ def to_motion(
         omega_3_errors=where_judged(rates.omega_3_errors),
         alpha_errors=where_judged(rates.alpha_errors),
         R=np.where(rotated[:, None, None], R, np.nan),
-        T_errors=np.hypot(center_errors, center_errors[0]),
+        T_errors=T_errors,
         R_errors=np.where(rotated[:, None], R_errors, np.nan),
         valid=(valid & identifiable).astype(np.uint8),
         flags=flags,
@@ -204,11 +210,12 @@ class _Rates:
     void: Bools
 
 
-def _rates(fit: Fit, assessment: Assessment, n: int, unseen: UnseenTurn | None) -> _Rates:
+def _rates(fit: Fit, assessment: Assessment, n: int, unseen: UnseenTurn | None, left: float) -> _Rates:
     time, R, omega = fit.path.time[:n], fit.path.R[:n], fit.path.omega[:n]
     covariance = _omega_covariance(
         omega, fit.spline.values(time), fit.spline.slopes(time), assessment.covariance
     )
+    covariance += left**2 * np.einsum("ni,ni->n", omega, omega)[:, None, None] * np.eye(3)
     alpha = np.hypot(omega[:, 0], omega[:, 1])
     v = np.where(alpha[:, None] > 0, omega[:, :2] / np.maximum(alpha, 1e-300)[:, None], [1.0, 0.0])
     across = np.stack([-v[:, 1], v[:, 0]], axis=1)
@@ -250,20 +257,19 @@ def _in_gauge(phi: Array) -> tuple[Array, bool]:
     return continuous - half_turns * np.pi, half_turns % 2 == 1
 
 
-def _centers(stack: Stack, fit: Fit, assessment: Assessment, pixel_size: float) -> tuple[Array, Array]:
-    """Return the centres C₂ as the object model sees them, and their errors."""
-    groups = len(fit.low.time)
-    own = fit.shift + np.einsum("gji,j->gi", fit.path.R[-groups:], assessment.middle)[:, :2]
-    # where the object's own centre lies is known as well as the mean centroid of all frames
-    lever = np.sqrt(np.pi / 4) * stack.low.radius**2 * pixel_size * stack.centers.noise
-    common = lever / float(np.nanmedian(stack.low.mass)) / np.sqrt(max(stack.seen.sum(), 1))
-    errors = np.hypot(assessment.shift_errors, common)
+def _centers(stack: Stack, fit: Fit, assessment: Assessment) -> tuple[Array, Array]:
+    """Return the centres C₂, where the object model is in each frame, and the errors of T."""
+    used = np.flatnonzero(stack.seen & ~stack.outlying)
+    variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
+    band = float(np.linalg.norm(fit.low.k, axis=1).max())
+    model = ObjectModel(fit.low, band, variance=variance)
+    own, errors = model.locate(fit, assessment.covariance, fit.path.R[used], stack.low.select(used))
 
-    def at_frames(series: Array) -> Array:
-        columns = [np.interp(stack.low.time, fit.low.time, column) for column in series.T]
+    def at_all(series: Array) -> Array:
+        columns = [np.interp(stack.low.time, stack.low.time[used], column) for column in series.T]
         return np.stack(columns, axis=1)
 
-    return stack.centers.center + at_frames(own), at_frames(errors)
+    return stack.centers.center + at_all(own), at_all(errors)
 
 
 def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
