@@ -91,13 +91,12 @@ def test_symmetry_about_an_axis_in_the_image_plane_is_counted(
     fold: int, factors: tuple[Fraction, ...] | None
 ) -> None:
     """f-fold and turning by θ, or g-fold and turning by θ f / g, for all g < f of the same parity."""
-    unseen = found(symmetric(fold, IN_PLANE.axis), IN_PLANE, 0.2 * NOISE)
+    unseen = found(symmetric(fold, IN_PLANE.axis), IN_PLANE, 0.5 * NOISE)
     if factors is None:
         assert unseen is None
         return
     assert unseen is not None
     assert unseen.factors == factors
-    assert unseen.folds == tuple(int(fold / factor) for factor in factors)
     assert unseen.turn == pytest.approx(2 * np.pi * 1.2, rel=0.01)
     assert f"{len(factors)} motions" in unseen.text
 

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
-from trapcli.motion.path import Path
+from trapcli.motion.path import Path, align
 
 Array = NDArray[np.float64]
 
@@ -64,17 +64,6 @@ class UnseenTurn:
     factors: tuple[Fraction, ...] = ()
 
     @property
-    def folds(self) -> tuple[int, ...]:
-        """The object's symmetry about the axis for each of the factors; 1 for none."""
-        inverse = [1 / factor for factor in self.factors]
-        unit = np.lcm.reduce([f.denominator for f in inverse]) if inverse else 1
-        least = [int(f * int(unit)) for f in inverse]
-        common = int(np.gcd.reduce(least)) if least else 1
-        least = [fold // common for fold in least]
-        # harmonics keep their parity
-        return tuple(fold * (1 if len({f % 2 for f in least}) == 1 else 2) for fold in least)
-
-    @property
     def text(self) -> str:
         """What is unseen, in words."""
         if not self.factors:
@@ -82,14 +71,11 @@ class UnseenTurn:
                 "ambiguous: the object looks like a body of revolution, whose spin about its axis can't be "
                 "seen; what depends on it is not given"
             )
-        motions = [
-            f"{abs(self.turn) * float(factor) / (2 * np.pi):.2f} turns of an object "
-            + (f"with a {fold}-fold axis" if fold > 1 else "without symmetry")
-            for factor, fold in zip(self.factors, self.folds, strict=True)
-        ]
+        turns = [abs(self.turn) * float(factor) / (2 * np.pi) for factor in self.factors]
         return (
-            f"ambiguous: {len(motions)} motions explain the images alike, {' or '.join(motions)}, about an "
-            "axis in the image plane; alpha and R are not given"
+            "ambiguous: the object looks symmetric about an axis in the image plane, and "
+            f"{len(turns)} motions explain the images alike, with "
+            f"{' or '.join(f'{turn:.2f}' for turn in turns)} turns about it; alpha and R are not given"
         )
 
 
@@ -196,16 +182,23 @@ class _Rivals:
 
     def as_good(self, path: Path, parameters: float) -> bool:
         """Tell whether a motion explains the images as well, where the noise decides so many parameters."""
+        apart = self._apart(path)
         for i, model in enumerate(self._models):
             if i == len(self._own):
                 self._own.append(self._refined(model, self._fit.path)[1:])
             path, cost, degrees = self._refined(model, path)
+            if self._apart(path) < 0.5 * apart:
+                return False
             own_cost, own_degrees = self._own[i]
             free = max(abs(own_degrees - degrees), parameters)
             allowed = free + _SIGNIFICANT * float(np.sqrt(2 * free)) + _MODEL_ERROR * own_cost
             if cost - degrees > own_cost - own_degrees + allowed:
                 return False
         return True
+
+    def _apart(self, path: Path) -> float:
+        """Return the mean angle between a motion and the fitted one, gauge removed."""
+        return float(align(path.R, self._fit.path.R)[0].mean())
 
     def _refined(self, model: ObjectModel, path: Path) -> tuple[Path, float, float]:
         """Return a motion bent to fit, its misfit and the degrees of freedom that are left."""
