@@ -257,3 +257,15 @@ def test_few_frames_do_not_break_it(paper_example, n: int) -> None:  # type: ign
     found = estimate(frames[:n], time[:n], 0.2)
     assert len(found) == n
     assert np.isfinite(found.T).all()
+
+
+def test_an_orientation_that_noise_has_lost_is_not_given(paper_example) -> None:  # type: ignore[no-untyped-def]
+    time, frames = paper_example
+    noise = np.random.default_rng(0).normal(scale=0.1 * frames.max(), size=frames.shape)
+    found = estimate(frames + noise, time, 0.2)
+    lost = np.isnan(found.R).any(axis=(1, 2))
+    assert lost.sum() > 50
+    assert np.isnan(found.R_errors[lost]).all()
+    assert not found.valid[lost].any()
+    assert not found.identifiable
+    assert np.rad2deg(np.linalg.norm(found.R_errors[~lost], axis=1).max(initial=0.0)) <= 20

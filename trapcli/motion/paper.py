@@ -17,6 +17,7 @@ from trapcli.motion.integrate import integrate_rotation, rotation_errors
 from trapcli.motion.reduced_map import reduce_frames
 from trapcli.motion.rotation_rates import AT_REST, RotationRates, rotation_rates
 from trapcli.motion.translation import translation
+from trapcli.motion.types import UNKNOWN_ROTATION
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
 
@@ -95,7 +96,12 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
     least = np.maximum(_SIGNIFICANT * rates.omega_3_errors, AT_REST / float(np.median(np.diff(time))))
     moving = ~rates.untilted | (np.abs(rates.omega_3) > least)
     valid = np.isfinite(omega).all(axis=1) & moving & (flags & ~np.uint16(Flag.ALPHA_ZERO) == 0)
-    identifiable = bool(valid.mean() >= _ENOUGH)
+    R = integrate_rotation(omega, time, bridge=max(_SHORTEST_BRIDGE, rates.window // 2))
+    R_errors = rotation_errors(omega, _covariance(rates, direction, tilt), time, rates.window / 2)
+    lost = np.linalg.norm(R_errors, axis=1) > UNKNOWN_ROTATION
+    R[lost] = np.nan
+    trusted = valid & ~lost
+    identifiable = bool(trusted.mean() >= _ENOUGH)
     T = translation(centers.center)
     return Motion(
         time=time,
@@ -105,17 +111,17 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
         phi=rates.phi,
         omega_3=rates.omega_3,
         alpha=rates.alpha,
-        R=integrate_rotation(omega, time, bridge=max(_SHORTEST_BRIDGE, rates.window // 2)),
+        R=R,
         T_errors=np.hypot(centers.errors, _first(centers.errors)),
         phi_errors=rates.phi_errors,
         omega_3_errors=rates.omega_3_errors,
         alpha_errors=rates.alpha_errors,
-        R_errors=rotation_errors(omega, _covariance(rates, direction, tilt), time, rates.window / 2),
-        valid=valid.astype(np.uint8),
+        R_errors=np.where(lost[:, None], np.nan, R_errors),
+        valid=trusted.astype(np.uint8),
         flags=flags,
         residual=rates.residual,
         identifiable=identifiable,
-        verdict=_verdict(valid, flags, rates, blank),
+        verdict=_verdict(valid, lost, flags, rates, blank),
         landscape=rates.landscape,
     )
 
@@ -142,7 +148,7 @@ def _covariance(rates: RotationRates, direction: Array, tilt: Array) -> Array:
     return covariance
 
 
-def _verdict(valid: Bools, flags: NDArray[np.uint16], rates: RotationRates, blank: Bools) -> str:
+def _verdict(valid: Bools, lost: Bools, flags: NDArray[np.uint16], rates: RotationRates, blank: Bools) -> str:
     """Say in words how far the motion is known and what stands in the way."""
     seen = int((~blank).sum())
     still = rates.untilted & ~valid
@@ -157,6 +163,7 @@ def _verdict(valid: Bools, flags: NDArray[np.uint16], rates: RotationRates, blan
         (silent, "omega_3 = -sigma, where the third-order equation says nothing about alpha"),
         (still, "nothing turns: the object is still, or turns about its own axis of symmetry"),
         (faint & ~still & ~valid, "alpha does not stand out of its error"),
+        (lost, "the errors of the rates have added up to an orientation that is not known to 20 degrees"),
     ]
     told = [f"{text} ({int(which.sum())} frames)" for which, text in reasons if which.sum() > 0.05 * seen]
     summary = f"motion found in {int(valid.sum())} of {len(valid)} frames"

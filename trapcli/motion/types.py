@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complexfloating]
 
+UNKNOWN_ROTATION = float(np.deg2rad(20.0))
+"""Error of R, 1 σ, beyond which a frame's orientation is not known [rad]."""
+
 
 @dataclass(frozen=True)
 class ReducedMap:

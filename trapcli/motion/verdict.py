@@ -13,7 +13,7 @@ from trapcli.motion.centers import Centers
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.translation import translation
-from trapcli.motion.types import ReducedMap
+from trapcli.motion.types import UNKNOWN_ROTATION, ReducedMap
 from trapcli.result.motion import Flag, Motion
 
 Array = NDArray[np.float64]
@@ -23,7 +23,6 @@ CERTIFIED = 1.08
 """Misfit per degree of freedom that pixel noise explains."""
 
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
-_UNKNOWN = np.deg2rad(20.0)  # error of R beyond which a frame's orientation is not known
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 _COARSE = np.deg2rad(1.0)  # error of R from which on the verdict mentions it
 _TOUCHED = 0.1  # share of an unseen turn in a component of ω that makes it unknown
@@ -141,7 +140,7 @@ def to_motion(
     turned = np.minimum(Rotation.from_matrix(R).magnitude(), 1.0)
     R_errors = np.hypot(R_errors, verdict.left * turned[:, None])
     rates = _rates(fit, assessment, n, unseen, verdict.left)
-    judged = stack.seen & (np.linalg.norm(R_errors, axis=1) <= _UNKNOWN)
+    judged = stack.seen & (np.linalg.norm(R_errors, axis=1) <= UNKNOWN_ROTATION)
     flags = _flags(stack)
     flags[rates.faint] |= np.uint16(Flag.ALPHA_ZERO)
     flags[rates.aimless] |= np.uint16(Flag.AMBIGUOUS_PHI)
