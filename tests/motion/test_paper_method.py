@@ -261,7 +261,7 @@ def test_few_frames_do_not_break_it(paper_example, n: int) -> None:  # type: ign
 
 def test_an_orientation_that_noise_has_lost_is_not_given(paper_example) -> None:  # type: ignore[no-untyped-def]
     time, frames = paper_example
-    noise = np.random.default_rng(0).normal(scale=0.1 * frames.max(), size=frames.shape)
+    noise = np.random.default_rng(0).normal(scale=0.01 * frames.max(), size=frames.shape)
     found = estimate(frames + noise, time, 0.2)
     lost = np.isnan(found.R).any(axis=(1, 2))
     assert lost.sum() > 50

@@ -116,7 +116,7 @@ def _motion(centers: Centers, rates: RotationRates, time: Array, frame: NDArray[
         phi_errors=rates.phi_errors,
         omega_3_errors=rates.omega_3_errors,
         alpha_errors=rates.alpha_errors,
-        R_errors=np.where(lost[:, None], np.nan, R_errors),
+        R_errors=np.where(np.isnan(R[:, :, 0]), np.nan, R_errors),
         valid=trusted.astype(np.uint8),
         flags=flags,
         residual=rates.residual,
