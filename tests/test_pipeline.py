@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import trapcli
 from trapcli.config import EstimateConfig, InputConfig, MotionConfig, PreprocessConfig, from_dict
 from trapcli.errors import ConfigError, InputError
-from trapcli.result.motion import Motion
+from trapcli.result.motion import Flag, Motion
 from trapcli.stack import Frames, StackInfo, open_stack
 from trapcli.stack.tiff import write_tiff
 
@@ -90,6 +90,15 @@ def test_raw_intensities_give_what_their_attenuation_gives(scene: tuple[NDArray[
     np.testing.assert_allclose(raw.T, plain.T, atol=1e-4)
     np.testing.assert_allclose(raw.phi, plain.phi, atol=1e-3)
     np.testing.assert_allclose(raw.omega_3, plain.omega_3, rtol=1e-3)
+
+
+def test_frames_without_a_projection_say_why(scene: tuple[NDArray[Any], Motion]) -> None:
+    raw = np.round(3000 * np.exp(-scene[0] / scene[0].max())).astype(np.uint16)
+    raw[20], raw[30] = 65535, 0
+    motion = trapcli.estimate(raw, background="border", method="paper")
+    assert motion.flags[20] & (Flag.SATURATED | Flag.BLANK) == Flag.SATURATED
+    assert motion.flags[30] & (Flag.SATURATED | Flag.BLANK) == Flag.BLANK
+    assert not motion.valid[[20, 30]].any()
 
 
 def test_an_argument_beats_the_configuration_and_both_are_kept(scene: tuple[NDArray[Any], Motion]) -> None:

@@ -23,9 +23,9 @@ from threadpoolctl import threadpool_limits
 
 from trapcli.config import EstimateConfig, to_toml
 from trapcli.errors import ConfigError, InputError
-from trapcli.preprocess.attenuation import GUESSED, to_attenuation
+from trapcli.preprocess.attenuation import GUESSED, Projections, to_attenuation
 from trapcli.result import provenance
-from trapcli.result.motion import Motion
+from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
 from trapcli.stack.source import calibrated
 
@@ -105,6 +105,10 @@ def estimate(
         guessed = not config.preprocess.attenuation and config.preprocess.background in GUESSED
         if guessed and config.motion.method == "auto":
             projections, motion = _without_dust(projections, motion, told, pixel)
+        if isinstance(projections, Projections):
+            left_out = projections.left_out
+            flags = np.where(left_out > 0, motion.flags & ~np.uint16(Flag.BLANK) | left_out, motion.flags)
+            motion = replace(motion, flags=flags)
     origin = provenance.collect(configuration=to_toml(config))
     if warnings := _warnings(projections, config):
         origin["warnings"] = "\n".join(warnings)

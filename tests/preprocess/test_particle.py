@@ -7,7 +7,8 @@ import pytest
 
 from trapcli.config import PreprocessConfig
 from trapcli.errors import InputError
-from trapcli.preprocess.attenuation import to_attenuation
+from trapcli.preprocess.attenuation import Projections, to_attenuation
+from trapcli.result.motion import Flag
 from trapcli.stack.frames import Frames
 
 SIZE, FRAMES, RADIUS, LIGHT = 80, 60, 16.0, 20_000.0
@@ -38,6 +39,12 @@ def left_out(frames: Frames) -> list[int]:
     return np.flatnonzero(np.isnan(frames.to_array()).all(axis=(1, 2))).tolist()
 
 
+def why(frames: Frames) -> dict[int, int]:
+    """Return the flag of each frame that is left out."""
+    assert isinstance(frames, Projections)
+    return {n: int(frames.left_out[n]) for n in left_out(frames)}
+
+
 @pytest.mark.parametrize("background", ["auto", "border"])
 def test_a_particle_alone_is_left_as_it_is(background: str) -> None:
     frames = projections(particle(), background)
@@ -66,6 +73,7 @@ def test_frames_in_which_debris_crosses_the_particle_are_left_out() -> None:
     assert set(touched) <= set(left_out(frames))
     assert len(left_out(frames)) <= len(touched) + 6
     assert any("left out" in warning for warning in frames.info.warnings)
+    assert set(why(frames).values()) == {Flag.OUTLIER}
 
 
 def test_a_smaller_neighbour_is_erased() -> None:
@@ -89,7 +97,7 @@ def test_frames_in_which_the_particle_leaves_the_field_are_left_out() -> None:
     frames = projections(leaving)
     assert set(cut) <= set(left_out(frames))
     assert min(left_out(frames)) > 45
-    assert any("left the field" in warning for warning in frames.info.warnings)
+    assert set(why(frames).values()) == {Flag.CLIPPED}
 
 
 def test_large_frames_are_looked_at_coarsely() -> None:

@@ -8,7 +8,7 @@ brighter or darker a frame is as a whole, its free pixels tell.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -20,6 +20,7 @@ from trapcli.errors import InputError
 from trapcli.preprocess.counts import Counts, mean_image
 from trapcli.preprocess.particle import Particle
 from trapcli.preprocess.surface import EmptyField, Light, border, fit_empty_field, median_field
+from trapcli.result.motion import Flag
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
@@ -57,6 +58,19 @@ class _Background:
     particle: Particle | None = None
 
 
+@dataclass(frozen=True)
+class Projections(Frames):
+    """Attenuation projections of raw frames.
+
+    Attributes
+    ----------
+    left_out:
+        ``(N,)`` uint16, `Flag` that says why a frame holds NaN; 0 for the others, and until it has been read.
+    """
+
+    left_out: NDArray[np.uint16] = field(kw_only=True)
+
+
 def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, ...] = ()) -> Frames:
     """Return the attenuation projections of raw frames, computed as they are read.
 
@@ -76,10 +90,10 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     Returns
     -------
     Frames
-        float32, or float64 where the input is. Pixels without light count as half a step above none. What
-        stays apart from the particle is erased. A frame is all NaN where more than 1 % of it has no light, or
-        is as bright as a pixel can be while most frames are not, or where something lies before the particle
-        or a part of it is missing. `StackInfo.notes` says which background was taken and why,
+        `Projections`; float32, or float64 where the input is. Pixels without light count as half a step above
+        none. What stays apart from the particle is erased. A frame is all NaN where more than 1 % of it has
+        no light, or is as bright as a pixel can be while most frames are not, or where something lies before
+        the particle or a part of it is missing. `StackInfo.notes` says which background was taken and why,
         `StackInfo.warnings` what is doubtful.
 
     Raises
@@ -96,24 +110,33 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     background = _background(frames, config.background, roi, counts)
     dtype = np.dtype(np.float64 if frames.dtype == np.float64 else np.float32)
 
-    def projection(image: NDArray[Any]) -> tuple[NDArray[Any], bool]:
-        """Return one projection, NaN where the frame is spoilt, and whether light is missing."""
+    left_out = np.zeros(len(frames), np.uint16)
+
+    def judged(image: NDArray[Any]) -> NDArray[Any] | Flag:
+        """Return one projection, or why there is none."""
         light = counts.log_light(image, dtype)
         spoilt = light.dark if background.keep_bright else light.dark | light.bright
         if _share(spoilt) > _FLAGGED:
-            return np.full(image.shape, np.nan, dtype), _share(light.dark) > _FLAGGED
+            return Flag.BLANK if _share(light.dark) > _FLAGGED else Flag.SATURATED
         attenuation = _attenuation(light.values, background).astype(dtype, copy=False)
-        alone = background.particle.alone(attenuation, light.dark) if background.particle else attenuation
-        return np.full(image.shape, np.nan, dtype) if alone is None else alone, False
+        return background.particle.alone(attenuation, light.dark) if background.particle else attenuation
+
+    def projection(position: int, image: NDArray[Any]) -> NDArray[Any]:
+        """Return one projection, NaN where there is none, and note why."""
+        found = judged(image)
+        if isinstance(found, Flag):
+            left_out[position] = found
+            return np.full(image.shape, np.nan, dtype)
+        return found
 
     def read_blocks(size: int) -> Iterator[NDArray[Any]]:
-        dark = 0
+        done = 0
         for block in frames.read_blocks(size):
             projections = np.empty(block.shape, dtype)
             for n, image in enumerate(block):
-                projections[n], is_dark = projection(image)
-                dark += is_dark
-            if dark > len(frames) / 2:
+                projections[n] = projection(done + n, image)
+            done += len(block)
+            if np.count_nonzero(left_out == Flag.BLANK) > len(frames) / 2:
                 raise InputError(
                     f"{frames.info.source}: most frames have pixels of 0 or less, which have no logarithm; "
                     "give --attenuation if they are attenuation already"
@@ -121,14 +144,14 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
             yield projections
 
     def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[Any]]:
-        return (projection(image)[0] for image in frames.pick(positions))
+        return (projection(n, image) for n, image in zip(positions, frames.pick(positions), strict=True))
 
     info = replace(
         frames.info,
         notes=(*frames.info.notes, background.note),
         warnings=(*frames.info.warnings, *background.warnings),
     )
-    return replace(frames, dtype=dtype, read_blocks=read_blocks, read_some=read_some, info=info)
+    return Projections(frames.shape, dtype, frames.index, info, read_blocks, read_some, left_out=left_out)
 
 
 def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any]:
@@ -170,8 +193,8 @@ def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float3
     if np.mean([particle.has_rival(image) for image in projections]) > _RIVAL:
         raise InputError(f"{frames.info.source}: shows two particles that stay apart; choose one with --roi")
     alone = [particle.alone(image) for image in projections]
-    spoilt = float(np.mean([image is None for image in alone]))
-    erased = float(np.mean([a is not None and a is not b for a, b in zip(alone, projections, strict=True)]))
+    spoilt = float(np.mean([isinstance(a, Flag) for a in alone]))
+    erased = float(np.mean([a is not b for a, b in zip(alone, projections, strict=True)])) - spoilt
     doubts = []
     if spoilt:
         doubts.append(

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from trapcli.result.motion import Flag
+
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
@@ -30,6 +32,7 @@ _TOUCHING = 0.02  # attenuation beyond that, as a share of all, that belongs to 
 _OFF = 0.01  # least error of the integral, as a share
 _OFF_SCATTER = 8.0  # the same in standard deviations of what is usual
 _RIM = 0.4  # error from that, in units of level times reach
+_RIM_WIDTH = 2  # of the edge of a frame [coarse pixels]
 _MOST_OFF = 0.3  # share of frames for which that tells nothing
 _FEWEST = 8  # frames that tell all this
 _RIVAL = 0.3  # attenuation of another particle, as a share of the particle's
@@ -47,6 +50,13 @@ class _Look:
     @cached_property
     def whole(self) -> float:
         return float(self.image[self.inside].sum())
+
+    @property
+    def at_edge(self) -> bool:
+        """Whether something stands out at the edge of the frame."""
+        rim = np.ones(self.inside.shape, bool)
+        rim[_RIM_WIDTH:-_RIM_WIDTH, _RIM_WIDTH:-_RIM_WIDTH] = False
+        return bool((self.inside & rim).any())
 
 
 @dataclass(frozen=True)
@@ -98,8 +108,8 @@ class Particle:
             return replace(particle, scatter=np.inf)
         return particle
 
-    def alone(self, image: NDArray[Any], unknown: Bools | None = None) -> NDArray[Any] | None:
-        """Return the ``(H, W)`` frame with nothing but the particle; None where that can't be had.
+    def alone(self, image: NDArray[Any], unknown: Bools | None = None) -> NDArray[Any] | Flag:
+        """Return the ``(H, W)`` frame with nothing but the particle; where that can't be had, why.
 
         Parameters
         ----------
@@ -114,9 +124,10 @@ class Particle:
         foreign = np.isin(look.labels, np.unique(look.labels[far])) if far.any() else far
         touching = bool(foreign[look.distance <= self.reach].any())
         if touching and look.image[far].sum() > _TOUCHING * look.whole:
-            return None
-        if self._is_off(look.image[look.inside & ~far].sum()):
-            return None
+            return Flag.OUTLIER
+        whole = float(look.image[look.inside & ~far].sum())
+        if self._is_off(whole):
+            return Flag.CLIPPED if whole < self.whole and look.at_edge else Flag.OUTLIER
         if touching or not far.any():
             return image
         mask = (
