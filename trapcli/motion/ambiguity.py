@@ -36,7 +36,7 @@ _WEAK = 0.3  # resistance to it, in units of that about other axes, from which o
 _PLANAR = np.sin(np.deg2rad(10.0))  # distance of γ from a great circle up to which it may be on one
 _FOLDS = range(1, 9)  # symmetries of an axis that are looked for
 _SYMMETRY_FACTORS = sorted({Fraction(f, g) for f in _FOLDS for g in _FOLDS if f != g and (f - g) % 2 == 0})
-_RIVAL = 0.1  # rise of the misfit, in units of what is common, up to which another turn is refined
+_RIVAL = 0.05  # rise of the misfit, in units of what is common, up to which another turn is refined
 _MOST_RIVALS = 4  # turns that are refined at most
 _LEAST = np.deg2rad(20.0)  # difference of two turns below which the stated errors tell
 _STEPS = 6  # of the refinement of another motion
@@ -166,9 +166,9 @@ def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTur
     groups = len(fit.low.time)
     own = coarse.cost(fit.path.R[-groups:], coarse.low.modes)
     rise = np.array([coarse.cost(other.R[-groups:], coarse.low.modes) - own for other in others])
-    found = [Fraction(1)]
+    found, noise = [Fraction(1)], _BEST_OF_MANY * fit.spline.size
     for i in np.argsort(rise)[:_MOST_RIVALS]:
-        if rise[i] < max(own, _RIVAL * np.median(rise)) and rivals.as_good(others[i], fit.spline.size):
+        if rise[i] < max(noise, _RIVAL * np.median(rise)) and rivals.as_good(others[i], fit.spline.size):
             found.append(factors[i])
     return UnseenTurn(axis, turned, tuple(sorted(found))) if len(found) > 1 else None
 
