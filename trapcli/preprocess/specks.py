@@ -234,9 +234,9 @@ class _Window:
     def white(self, pixels: NDArray[Any]) -> Array:
         return np.asarray(linalg.solve_triangular(self.root, pixels, lower=True, check_finite=False))
 
-    def of(self, images: NDArray[Any]) -> Array:
-        """Return ``(P,)`` whitened pixels of an image, or ``(P, K)`` of K."""
-        return self.white(images[..., self.rows, self.columns][..., self.keep].T)
+    def of(self, image: Array) -> Array:
+        """Return ``(P,)`` whitened pixels of an image."""
+        return self.white(image[self.rows, self.columns][self.keep])
 
     def profiles(self, specks: Array) -> Array:
         """Return ``(P,)`` whitened pixels of ``(S, 4)`` specks."""
@@ -277,7 +277,8 @@ def _fit(
     target = window.of(standing.image - others)
     starts = [np.array([[*place, size, -0.1 * sign], *known]) for size in _SIZES]
     found = min((window.fit(start, target) for start in starts), key=lambda result: float(result.cost))
-    series = window.of(np.nan_to_num(standing.frames) - others)
+    frames = np.nan_to_num(standing.frames[:, rows, columns]) - others[rows, columns]
+    series = window.white(frames[:, keep].T)
     # frames in which the particle is smooth here tell more
     left = series - window.profiles(found.x.reshape(-1, 4))[:, None]
     weights = 1 / np.maximum(np.mean(left**2, axis=0), 1e-300)
