@@ -75,7 +75,7 @@ def test_light_that_tilts_is_followed() -> None:
     frames = stack(uneven(), 0.02 * np.sin(np.arange(FRAMES) / 5)[:, None, None] * COLUMNS / (SIZE / 2))
     found = fit_empty_field(frames)
     assert len(found.light.surface) == 3
-    evened = found.light.even(frames - found.log_light.astype(np.float32))
+    evened = found.light.even(frames, found.log_light)
     free = np.hypot(ROWS, COLUMNS) > 40
     slopes = evened[:, free] @ COLUMNS[free] / np.sum(COLUMNS[free] ** 2)
     assert np.abs(slopes).max() * SIZE / 2 < 0.001

@@ -96,11 +96,13 @@ class Light:
             return coefficients
         return np.asarray((coefficients @ self.surface).reshape(shape))
 
-    def even(self, log_ratio: Stack) -> Stack:
-        """Return a ``(K, H, W)`` log(I / I₀) without each frame's light; all NaN where nothing tells it."""
-        coefficients = np.array([self.fit(image) for image in log_ratio])
-        light = coefficients.astype(np.float32) @ self.surface.astype(np.float32)
-        return np.asarray(log_ratio - light.reshape(log_ratio.shape))
+    def even(self, logs: Stack, field: Array) -> Stack:
+        """Return ``(K, H, W)`` log(I / I₀) without each frame's light; all NaN where nothing tells it."""
+        evened, single = np.empty_like(logs), field.astype(np.float32)
+        for image, log in zip(evened, logs, strict=True):
+            np.subtract(log, single, out=image)
+            image -= self.of(self.fit(image), image.shape).astype(np.float32)
+        return evened
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def border(shape: tuple[int, ...]) -> Bools:
 
 def median_field(logs: Stack) -> Array:
     """Return the median in time of ``(K, H, W)`` log I, made equally bright at the border."""
-    return _middle(Light.over(border(logs.shape[1:])).even(logs))
+    return _middle(Light.over(border(logs.shape[1:])).even(logs, np.zeros(logs.shape[1:])))
 
 
 def fit_empty_field(logs: Stack) -> EmptyField:
@@ -155,23 +157,23 @@ def fit_empty_field(logs: Stack) -> EmptyField:
     """
     edge = border(logs.shape[1:])
     light = Light.over(edge)
-    common = _middle(light.even(logs))
+    common = _middle(light.even(logs, np.zeros(logs.shape[1:])))
     field = _surface(common, edge & np.isfinite(common), 2)
     noise = _noise(logs, edge)
     degree, pattern, specks = 2, np.zeros(field.shape), 0
     outside = np.ones(logs.shape, bool)
     for step, depth in enumerate(_DEPTHS):
-        residual = light.even(logs - (field + pattern).astype(np.float32))
+        residual = light.even(logs, field + pattern)
         outside = _outside(residual, noise, depth)
         quiet = outside.mean(axis=0) >= _QUIET
-        tilted = _is_tilted(logs - (field + pattern).astype(np.float32), quiet, noise)
+        tilted = _is_tilted(logs, field + pattern, quiet, noise)
         light = Light.over(quiet, tilted=tilted)
-        mean, count = _mean_outside(light.even(logs - (field + pattern).astype(np.float32)), outside)
+        mean, count = _mean_outside(light.even(logs, field + pattern), outside)
         mean += field + pattern
         degree = _degree(mean, count)
         field = _surface(mean, count, degree)
         pattern, specks = _pattern(
-            light.even(logs - field.astype(np.float32)),
+            light.even(logs, field),
             mean - field,
             count,
             noise,
@@ -210,13 +212,17 @@ def _noise(logs: Stack, edge: Bools) -> float:
 
 def _outside(residual: Stack, noise: float, depth: float) -> Bools:
     """Tell which pixels of each frame the particle leaves free, with a margin around it."""
-    smooth = np.array([ndimage.uniform_filter(np.nan_to_num(image), _PATCH) for image in residual])
-    peak = float(np.median(np.quantile(np.abs(smooth), 0.999, axis=(1, 2))))
-    inside = np.abs(smooth) > max(_CLEAR * noise, depth * peak)
+    smooth = np.empty_like(residual)
+    for image, raw in zip(smooth, residual, strict=True):
+        ndimage.uniform_filter(np.nan_to_num(raw), _PATCH, output=image)
+    np.abs(smooth, out=smooth)
+    peak = float(np.median([np.quantile(image, 0.999) for image in smooth]))
+    inside = smooth > max(_CLEAR * noise, depth * peak)
     inside &= ~_stuck(inside)
     reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
-    grown = [ndimage.maximum_filter(image, reach) for image in inside]
-    return ~np.array(grown) & np.isfinite(residual)
+    for image in inside:
+        image[:] = ndimage.maximum_filter(image, reach)
+    return ~inside & np.isfinite(residual)
 
 
 def _stuck(inside: Bools) -> Bools:
@@ -231,7 +237,9 @@ def _stuck(inside: Bools) -> Bools:
 def _mean_outside(residual: Stack, outside: Bools) -> tuple[Array, Array]:
     """Return the mean over the frames in which a pixel is free, and their number."""
     count = outside.sum(axis=0, dtype=float)
-    total = np.where(outside, residual, 0).sum(axis=0, dtype=float)
+    total = np.zeros(count.shape)
+    for image, free in zip(residual, outside, strict=True):
+        np.add(total, image, out=total, where=free)
     return total / np.maximum(count, 1), count
 
 
@@ -291,10 +299,10 @@ def _pattern(residual: Stack, direct: Array, count: Array, noise: float, look: b
     return np.where(measured & ~fitted, pattern, specks), number
 
 
-def _is_tilted(residual: Stack, quiet: Bools, noise: float) -> bool:
+def _is_tilted(logs: Stack, field: Array, quiet: Bools, noise: float) -> bool:
     """Tell whether the light tilts from frame to frame, by more than the noise makes of a steady one."""
     light = Light.over(quiet, tilted=True)
-    tilts = np.array([light.fit(image)[1:] for image in residual])
+    tilts = np.array([light.fit(image - field)[1:] for image in logs])
     tilts = tilts[np.isfinite(tilts).all(axis=1)]
     if len(tilts) < 8:
         return False
