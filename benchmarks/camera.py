@@ -202,7 +202,8 @@ def report(results: dict[str, Any], seeds: int) -> str:
             "|---|---|---|---|---|---|---|---|---|---|---|",
             *rows,
             "",
-            f"Meant for {seeds} scenes a row; the column says how many have been run, and a further run goes on.",
+            f"Meant for {seeds} scenes a row; the column says how many have been run, and another run "
+            "goes on.",
             f"Not run at all: {', '.join(unseen) or 'none'}.",
             "",
             f"Made by `python benchmarks/camera.py` ({machine}).",

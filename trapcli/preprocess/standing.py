@@ -8,8 +8,8 @@ C₂ (``eqRecMapReduced``),
 linear in the object u and in b. The object is eliminated exactly; b is a sum of points, each with a prior
 variance of its own that makes the data likeliest, so that few points remain where few are needed (Tipping
 2001, Journal of Machine Learning Research 1; MacKay 1992, DOI 10.1162/neco.1992.4.3.415). What both could
-explain, a pattern that is round about the rotation's axis, is left to the object, where it does no harm. Then
-the motion is fitted to what is left, and so on, until the pattern stays as it is.
+explain, a pattern that is round about the rotation's axis, is left to the object: at the right motion it
+explains the images as well. Then the motion is fitted to what is left, and so on, until the pattern stays.
 """
 
 from __future__ import annotations
