@@ -155,7 +155,7 @@ def to_motion(
             "the images leave the rotation open by more than 20 degrees: "
             "a symmetric object, too much noise or too little rotation"
         )
-    elif identifiable and (largest := float(R_errors[valid].max())) > _COARSE:
+    elif identifiable and (largest := float(np.linalg.norm(R_errors[valid], axis=1).max())) > _COARSE:
         text += f"; errors of the orientation reach {np.rad2deg(largest):.1f} degrees (1 sigma)"
 
     def where_judged(values: Array) -> Array:
