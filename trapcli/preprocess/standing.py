@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from trapcli.motion.fourier_slices import back_project, slice_points
 from trapcli.motion.front_end import read_front_end
-from trapcli.motion.low_band import SQUARE, LowBand
+from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline
 from trapcli.result.motion import Motion
@@ -129,9 +129,7 @@ class _Views:
     def of(cls, low: LowBand, center: Array, size: int) -> _Views:
         """Average groups of `size` frames."""
         grouped = low.grouped(size)
-        groups = len(grouped.time)
-        phase = np.exp(1j * center[: groups * size] @ low.k.T)
-        return cls(grouped, phase.reshape(groups, size, -1).mean(axis=1))
+        return cls(grouped, group_means(np.exp(1j * center @ low.k.T), len(grouped.time)))
 
     def shifted(self, shift: Array) -> _Views:
         """Move the centres by ``(G, 2)`` `shift`."""
