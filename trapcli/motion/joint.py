@@ -273,7 +273,12 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
         own, before = (np.trace(a.covariance[:, 2, :, 2]) for a in (honest, assessment))
         covariance = assessment.covariance * max(own / before, fit.cost / assessment.degrees)
     return again, replace(
-        honest, covariance=covariance, degrees=assessment.degrees, mode_misfit=honest.mode_misfit * excess
+        honest,
+        covariance=covariance,
+        degrees=assessment.degrees,
+        # what is left over is told in units of the pixel noise
+        frame_misfit=assessment.frame_misfit,
+        mode_misfit=honest.mode_misfit * excess,
     )
 
 
