@@ -21,6 +21,9 @@ from trapcli.errors import ConfigError
 
 MAX_TOML_BYTES = 64 << 10
 
+GUESSED_BACKGROUNDS = ("auto", "median", "surface", "border", "none")
+"""Backgrounds that the frames themselves are to tell; any other is a file."""
+
 C = TypeVar("C")
 
 

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from trapcli.config import EstimateConfig, to_toml
+from trapcli.config import GUESSED_BACKGROUNDS, EstimateConfig, to_toml
 from trapcli.errors import ConfigError, InputError
-from trapcli.preprocess.attenuation import GUESSED, Projections, to_attenuation
+from trapcli.preprocess.attenuation import Projections, to_attenuation
 from trapcli.result import provenance
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
@@ -102,7 +102,7 @@ def estimate(
             recover, config=config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
         )
         motion = told(projections)
-        guessed = not config.preprocess.attenuation and config.preprocess.background in GUESSED
+        guessed = not config.preprocess.attenuation and config.preprocess.background in GUESSED_BACKGROUNDS
         if guessed and config.motion.method == "auto":
             projections, motion = _without_dust(projections, motion, told, pixel)
         if isinstance(projections, Projections):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from trapcli.config import EstimateConfig, to_toml
+from trapcli.config import GUESSED_BACKGROUNDS, EstimateConfig, to_toml
 from trapcli.errors import InputError, OutputError, TrapError
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 DONE, FAILED, NOT_TRUSTWORTHY = 0, 1, 4
 STANDARD_INPUT = "-"
-BACKGROUNDS = ("auto", "median", "surface", "border", "none")
 
 _FOLDER = threading.Lock()  # the working folder belongs to a process, not to its threads
 
@@ -116,7 +115,7 @@ def _origin(job: Job, frames: Frames) -> dict[str, str]:
     from trapcli.stack import open_stack
 
     preprocess = job.config.preprocess
-    given = [] if preprocess.background in BACKGROUNDS else [preprocess.background]
+    given = [] if preprocess.background in GUESSED_BACKGROUNDS else [preprocess.background]
     if preprocess.dark_level is None:
         given.append(preprocess.dark)
     files = frames.info.files

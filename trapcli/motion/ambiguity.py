@@ -101,7 +101,7 @@ def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | N
     low = fit.low.shifted(np.einsum("gji,j->gi", R, assessment.middle)[:, :2])
     centred = replace(fit, low=low)
     # what the lower half of the band tells apart needs no finer look
-    models = [_model(centred, assessment, share * band) for share in (0.5, 1.0)]
+    models = [ObjectModel.after(centred, assessment, share * band) for share in (0.5, 1.0)]
     rivals = _Rivals(centred, models)
     axis = _axis_of_revolution(models[0], R, _least_resisted_axes(fit, assessment))
     if axis is not None:
@@ -110,13 +110,6 @@ def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | N
         if rivals.as_good(_spun(fit.path, axis, spin), _BEST_OF_MANY * fit.spline.size):
             return UnseenTurn(axis, 0.0)
     return _other_symmetry(fit, models[0], rivals)
-
-
-def _model(fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
-    """Return the object model whose noise is what the motion leaves."""
-    inside = np.hypot(fit.low.k[:, 0], fit.low.k[:, 1]) <= band * (1 + 1e-9)
-    variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
-    return ObjectModel(fit.low, band, variance=variance[inside])
 
 
 def _least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:

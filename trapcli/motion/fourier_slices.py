@@ -53,6 +53,11 @@ def slice_points(R: Array, k: Array, spacing: float = 1.0) -> list[Array]:
     return [np.ascontiguousarray(points[:, axis].ravel()) for axis in range(3)]
 
 
+def conjugate_share(k: Array) -> Array:
+    """Return ``(K,)`` how many modes each stands for: k = 0 is its own conjugate, every other one is two."""
+    return np.where((k == 0).all(axis=1), 1.0, 2.0)
+
+
 def project(points: list[Array], lattice: Real | Complex) -> Complex:
     """Return ``Σ_b lattice[b] exp(−i⟨point, b⟩)``, the modes of an object on a lattice.
 

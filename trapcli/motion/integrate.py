@@ -113,4 +113,9 @@ def _reach(known: NDArray[np.bool_], bridge: int) -> int:
 def _filled(series: Array, time: Array) -> Array:
     """Interpolate unknown frames linearly; the ends are continued by the nearest known frame."""
     known = _known(series)
-    return np.stack([np.interp(time, time[known], column[known]) for column in series.T], axis=1)
+    return interpolated(time, time[known], series[known])
+
+
+def interpolated(time: Array, known: Array, series: Array) -> Array:
+    """Return an ``(M, D)`` series given at ``(M,)`` times `known`, linearly interpolated at other times."""
+    return np.stack([np.interp(time, known, column) for column in series.T], axis=1)

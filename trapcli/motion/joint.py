@@ -23,7 +23,7 @@ from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
-from trapcli.motion.path import Path, Spline, align
+from trapcli.motion.path import Spline, align
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import CERTIFIED, Stack, judge, nothing_known, to_motion
 from trapcli.result.motion import Motion
@@ -132,7 +132,7 @@ def estimate_joint(
     fit, assessment = best
     verdict = judge(fit, assessment)
     unseen = unseen_turn(fit, assessment, fine_band) if verdict.identifiable else None
-    return to_motion(stack, fit, assessment, verdict, pixel_size, unseen)
+    return to_motion(stack, fit, assessment, verdict, unseen)
 
 
 def _outliers(low: LowBand) -> Bools:
@@ -224,7 +224,7 @@ def _refine(
     )
     if knots:
         rough = fine = Spline(time[0], time[-1], knots)
-    path = _resampled(hypothesis.path, rough, np.concatenate([time, fine.grid, low.time]))
+    path = hypothesis.path.near(rough, np.concatenate([time, fine.grid, low.time]))
     coarse = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
     path = coarse.fit(path, low.time, rough, smooth=False).path
     if not knots:
@@ -263,7 +263,7 @@ def _relative_noise(stack: Stack) -> float:
 def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fit, Assessment]:
     """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
     excess = np.maximum(assessment.mode_misfit, 1.0)
-    model = ObjectModel(fit.low, band, variance=fit.low.variance * excess)
+    model = ObjectModel.after(fit, assessment, band)
     again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
@@ -280,11 +280,3 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
         frame_misfit=assessment.frame_misfit,
         mode_misfit=honest.mode_misfit * excess,
     )
-
-
-def _resampled(path: Path, spline: Spline, times: Array) -> Path:
-    """Return the path of the spline nearest to ω of `path`, at other times."""
-    middle = 0.5 * (path.time[1:] + path.time[:-1])
-    ascending, back = np.unique(times, return_inverse=True)
-    smooth = Path.smooth(spline, spline.fit(middle, path.mean_omega()), ascending)
-    return Path(times, smooth.R[back], smooth.omega[back])

@@ -23,7 +23,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from trapcli.motion.fourier_slices import back_project, project, slice_points
+from trapcli.motion.fourier_slices import back_project, conjugate_share, project, slice_points
+from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
@@ -106,7 +107,7 @@ class ObjectModel:
     band:
         Highest spatial frequency [rad / length].
     variance:
-        ``(K,)`` noise of each mode, model error included; None for white noise.
+        ``(K,)`` noise of each mode of `low`, model error included; None for white noise.
     weights:
         ``(G,)`` weight of each frame.
     """
@@ -117,10 +118,9 @@ class ObjectModel:
         inside = np.hypot(low.k[:, 0], low.k[:, 1]) <= band * (1 + 1e-9)
         self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
         self.band = band
-        self.variance = np.full(inside.sum(), low.variance) if variance is None else variance
+        self.variance = np.full(inside.sum(), low.variance) if variance is None else variance[inside]
         self.weights = np.ones(len(low.time)) if weights is None else weights
-        # k = 0 is its own conjugate, every other mode stands for two
-        self._share = np.where((self.low.k == 0).all(axis=1), 1.0, 2.0)
+        self._share = conjugate_share(self.low.k)
         self._root = np.sqrt(self.weights[:, None] * self._share / self.variance)
         # of a cubic lattice that repeats the spectrum as far away as the body-centred one does
         spacing = np.pi / (band + _GUARD / low.radius)
@@ -140,12 +140,18 @@ class ObjectModel:
         power = np.maximum(power - self.variance, 0.01 * self.variance)
         # amplitudes of unit variance then give at least the power that is seen
         self._blob = blob * np.sqrt(np.max(power / blob**2) / len(self._index))
+        self._gain = self._root * self._blob
         # places of differences and sums of lattice points among all, for one point of each opposite pair
         edge = 4 * self._half + 1
         flat = self._index[: len(self._index) // 2 + 1] @ np.array([edge**2, edge, 1])
         middle = 2 * self._half * (edge**2 + edge + 1)
         self._difference = (flat[:, None] - flat[None, :] + middle).astype(np.int32)
         self._sum = (flat[:, None] + flat[None, :] + middle).astype(np.int32)
+
+    @classmethod
+    def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
+        """Return the model whose noise is raised, mode by mode, to what a fit has left over."""
+        return cls(fit.low, band, variance=fit.low.variance * np.maximum(assessment.mode_misfit, 1.0))
 
     @property
     def data_count(self) -> float:
@@ -269,22 +275,21 @@ class ObjectModel:
         values = fit.spline.values(fit.low.time)
         views = self._views(fit.path.R[-len(values) :])
         state = self._state(views, fit.low.modes)
-        moved = np.stack([np.interp(low.time, fit.low.time, column) for column in fit.shift.T], axis=1)
+        moved = interpolated(low.time, fit.low.time, fit.shift)
         modes = low.modes[:, : len(self.low.k)] * np.exp(1j * moved @ self.low.k.T)
         noise = self.variance * (low.variance / self.low.variance)
         points = slice_points(R, self.low.k, self.spacing)
         model, slopes = self._model(R, points, state.amplitude)
         root = np.sqrt(self._share / noise)
-        single = _State(state.amplitude, (modes - model) * root, slopes * root[:, None], 0.0)
-        own = _shift_covariance(single)
-        down = np.einsum("gki,gk->gi", single.slopes[..., 3:].conj(), single.residual).real
+        shifts = slopes[..., 3:] * root[:, None]
+        own = _shift_covariance(shifts)
+        down = np.einsum("gki,gk->gi", shifts.conj(), (modes - model) * root).real
         place = moved + np.einsum("gij,gj->gi", own, down)
         place += np.einsum("gji,j->gi", R, self._middle(state))[:, :2]
         alone = np.diagonal(own, axis1=1, axis2=2) + np.diag(own[0])
         alone[0] = 0.0
         common = self._common_errors(views, state, values, covariance)
-        shared = np.stack([np.interp(low.time, fit.low.time, column) for column in common.T], axis=1)
-        return place, np.sqrt(alone + shared**2)
+        return place, np.sqrt(alone + interpolated(low.time, fit.low.time, common) ** 2)
 
     def _common_errors(self, views: _Views, state: _State, values: Array, covariance: Array) -> Array:
         """Return ``(G, 2)`` errors of the way from the first group that object and motion cause [length]."""
@@ -292,14 +297,11 @@ class ObjectModel:
         middle = self._middle(state)
         arm = (self.position - middle) / state.amplitude.sum()
         lever = np.stack([np.concatenate(_folded(column)) for column in arm.T], axis=1)
-        scale = self._blob * np.sqrt(self._share / self.variance)
         flat = covariance.reshape(2 * (3 * values.shape[1],))
         first: tuple[Array, Array] | None = None
         errors = np.zeros((len(values), 2))
         for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
-            column = self._back_projected(
-                rotation, slopes[:, 3:] * (scale * np.sqrt(self.weights[g]))[:, None]
-            )
+            column = self._back_projected(rotation, slopes[:, 3:] * self._gain[g, :, None])
             # the centre is the shift and the middle, which follow the object and the motion
             followed = lever @ rotation[:, :2] - column @ eliminated.shift_covariance[g]
             by_object = scipy.linalg.solve_triangular(
@@ -320,7 +322,7 @@ class ObjectModel:
     def _views(self, R: Array) -> _Views:
         """Return what the orientations alone decide: where the frames look, and the normal matrix."""
         points = slice_points(R, self.low.k, self.spacing)
-        density = ((self._root * self._blob) ** 2).ravel().astype(complex)
+        density = (self._gain**2).ravel().astype(complex)
         # the normal matrix spans ten orders of magnitude: it needs the transforms' double precision
         kernel = back_project(points, density, 4 * self._half + 1).ravel()
         across, along = kernel[self._sum], kernel[self._difference]
@@ -352,12 +354,12 @@ class ObjectModel:
         place = 0.5 * self.spacing * np.arange(-2 * self._half, 2 * self._half + 1)
         along = np.stack([cube * place[:, None, None], cube * place[:, None], cube * place])
         slopes = project(views.points, along).imag.reshape(3, *self._root.shape)
-        turned = _turning(views.R, self.low.k, slopes * (self._root * self._blob) ** 2)
+        turned = _turning(views.R, self.low.k, slopes * self._gain**2)
         return np.asarray(turned.sum(axis=1))
 
     def _right(self, views: _Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
-        waves = (self._root * self._blob * whitened).ravel()
+        waves = (self._gain * whitened).ravel()
         lattice = back_project(views.points, waves, 2 * self._half + 1)
         return np.asarray(lattice[self._mask])
 
@@ -400,13 +402,14 @@ class ObjectModel:
 
         With the object held the shifts would creep, as the object has been fitted to frames out of place.
         """
-        slopes, covariance = state.slopes[..., 3:], _shift_covariance(state)
+        slopes = state.slopes[..., 3:]
+        covariance = _shift_covariance(slopes)
         lattice = _Lattice(views.points, self._mask)
 
         def curved(shift: Array) -> Array:
             moved = np.einsum("gki,gi->gk", slopes, shift)
-            right = lattice.gathered(self._root * self._blob * moved)
-            moved -= self._root * self._blob * lattice.waves(views.solve(right)).reshape(moved.shape)
+            right = lattice.gathered(self._gain * moved)
+            moved -= self._gain * lattice.waves(views.solve(right)).reshape(moved.shape)
             return np.asarray(np.einsum("gki,gk->gi", slopes.conj(), moved).real)
 
         shift = np.zeros(slopes.shape[::2])
@@ -457,17 +460,16 @@ class ObjectModel:
     def _eliminated(self, views: _Views, state: _State, values: Array) -> _Eliminated:
         """Eliminate the object and the shifts from the normal equations of a motion."""
         curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
-        inverse = _shift_covariance(state)
+        inverse = _shift_covariance(state.slopes[..., 3:])
         carry = curvature[:, :3, 3:] @ inverse
         own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
         root = np.linalg.cholesky(inverse)
-        scale = self._blob * np.sqrt(self._share / self.variance)
         size = values.shape[1]
         coupling = np.zeros((size, len(self.position), 3))
         reduced = scipy.linalg.block_diag(*views.blocks)
         stack: list[Array] = []
         for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
-            column = self._back_projected(rotation, slopes * (scale * np.sqrt(self.weights[g]))[:, None])
+            column = self._back_projected(rotation, slopes * self._gain[g, :, None])
             turned = column[:, :3] - column[:, 3:] @ carry[g].T
             for b in np.flatnonzero(values[g]):
                 coupling[b] += values[g, b] * turned
@@ -601,9 +603,8 @@ class _State:
     cost: float
 
 
-def _shift_covariance(state: _State) -> Array:
-    """Return the ``(G, 2, 2)`` inverse of the misfit's curvature by the shifts, for a known object."""
-    shifts = state.slopes[..., 3:]
+def _shift_covariance(shifts: ComplexArray) -> Array:
+    """Return ``(G, 2, 2)`` covariances of shifts with whitened ``(G, K, 2)`` slopes, for a known object."""
     curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
     curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
     return np.asarray(np.linalg.inv(curvature), float)

@@ -93,6 +93,13 @@ class Path:
         omega = spline.values(time) @ coefficients
         return cls(time, integrate_rotation(omega, time), omega)
 
+    def near(self, spline: Spline, times: Array) -> Path:
+        """Return the path of the spline nearest to ω of this one, at other `times` in any order."""
+        middle = 0.5 * (self.time[1:] + self.time[:-1])
+        ascending, back = np.unique(times, return_inverse=True)
+        smooth = Path.smooth(spline, spline.fit(middle, self.mean_omega()), ascending)
+        return Path(times, smooth.R[back], smooth.omega[back])
+
     def bent(self, spline: Spline, coefficients: Array) -> Path:
         """Return ``R exp([δ]×)`` for the spline δ with ``(size, 3)`` coefficients [rad]."""
         delta, slope = spline.values(self.time) @ coefficients, spline.slopes(self.time) @ coefficients

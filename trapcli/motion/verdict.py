@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from trapcli.motion.ambiguity import UnseenTurn
 from trapcli.motion.centers import Centers
+from trapcli.motion.fourier_slices import conjugate_share
+from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.translation import translation
@@ -68,7 +70,7 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
             text += "; it turns about the optical axis alone, as far as can be told: phi is undefined"
         return Verdict(True, text)
     changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
-    share = np.where((fit.low.k == 0).all(axis=1), 1.0, 2.0)
+    share = conjugate_share(fit.low.k)
     left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
     error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
     if error <= _MODEL_ERROR:
@@ -127,7 +129,6 @@ def to_motion(
     fit: Fit,
     assessment: Assessment,
     verdict: Verdict,
-    pixel_size: float,
     unseen: UnseenTurn | None = None,
 ) -> Motion:
     """Put the fitted path into the gauge of the result, with errors and flags; leave out what is unseen."""
@@ -259,16 +260,11 @@ def _in_gauge(phi: Array) -> tuple[Array, bool]:
 def _centers(stack: Stack, fit: Fit, assessment: Assessment) -> tuple[Array, Array]:
     """Return the centres C₂, where the object model is in each frame, and the errors of T."""
     used = np.flatnonzero(stack.seen & ~stack.outlying)
-    variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
-    band = float(np.linalg.norm(fit.low.k, axis=1).max())
-    model = ObjectModel(fit.low, band, variance=variance)
+    model = ObjectModel.after(fit, assessment, float(np.linalg.norm(fit.low.k, axis=1).max()))
     own, errors = model.locate(fit, assessment.covariance, fit.path.R[used], stack.low.select(used))
-
-    def at_all(series: Array) -> Array:
-        columns = [np.interp(stack.low.time, stack.low.time[used], column) for column in series.T]
-        return np.stack(columns, axis=1)
-
-    return stack.centers.center + at_all(own), at_all(errors)
+    time = stack.low.time
+    place, errors = (interpolated(time, time[used], series) for series in (own, errors))
+    return stack.centers.center + place, errors
 
 
 def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:

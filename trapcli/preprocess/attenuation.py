@@ -25,9 +25,6 @@ from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
 
-GUESSED = ("auto", "median", "surface", "border", "none")
-"""Backgrounds that the frames themselves are to tell; any other is a file."""
-
 _FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
 _LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
 _COVERED = 0.01  # share of the pixels that may be free less often

@@ -22,7 +22,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from trapcli.motion.fourier_slices import back_project, slice_points
+from trapcli.motion.fourier_slices import back_project, conjugate_share, slice_points
 from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import ObjectModel
@@ -84,7 +84,7 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
     views = _Views.of(low, center, size)
     intervals = min(max(_FEWEST_KNOTS, round(turned / _KNOTS)), len(views.low.time) // 3)
     spline = Spline(time[0], time[-1], intervals)
-    path = _along(path, spline, views.low.time)
+    path = path.near(spline, np.concatenate([spline.grid, views.low.time]))
     points = _Points.over(low, np.median(center, axis=0))
     odds, values = _pattern(views, path, points)
     if odds < _CONVINCING:
@@ -175,26 +175,12 @@ class _Points:
         x1, x2 = ((np.arange(size) - size // 2) * pixel_size for size in reversed(shape))
         across, down = np.exp(1j * np.outer(self.k[:, 0], x1)), np.exp(1j * np.outer(self.k[:, 1], x2))
         cell = float(self.k[1] @ self.k[1]) / (2 * np.pi)
-        modes = cell * _share(self.k) * (self.waves @ values)
+        modes = cell * conjugate_share(self.k) * (self.waves @ values)
         image = ((modes[:, None] * down).T @ across).real
         # the modes are those of a square, beyond which the image repeats
         middle = self.place.mean(axis=0)
         near = np.hypot(x1 - middle[0], (x2 - middle[1])[:, None]) <= SQUARE * self.radius
         return np.asarray(np.where(near, image, 0.0))
-
-
-def _share(k: Array) -> Array:
-    """Return how many modes each stands for: k = 0 is its own conjugate."""
-    return np.where((k == 0).all(axis=1), 1.0, 2.0)
-
-
-def _along(path: Path, spline: Spline, times: Array) -> Path:
-    """Return the path of the spline nearest to ω of `path` on the spline's grid, followed by `times`."""
-    middle = 0.5 * (path.time[1:] + path.time[:-1])
-    wanted = np.concatenate([spline.grid, times])
-    ascending, back = np.unique(wanted, return_inverse=True)
-    smooth = Path.smooth(spline, spline.fit(middle, path.mean_omega()), ascending)
-    return Path(wanted, smooth.R[back], smooth.omega[back])
 
 
 def _pattern(views: _Views, path: Path, points: _Points) -> tuple[float, Array]:
@@ -264,7 +250,7 @@ def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
     """Eliminate the object."""
     low, band = views.low, _BAND / views.low.radius
     k, spacing = low.k, _SPACING * np.pi / band
-    weight = _share(k) / low.variance
+    weight = conjugate_share(k) / low.variance
     half = int(_REACH * low.radius / spacing)
     axis = np.arange(-half, half + 1)
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from trapcli.errors import InputError
 from trapcli.motion.centers import object_radius, pixel_noise, sample_frames
-from trapcli.motion.fourier_slices import processors
+from trapcli.motion.fourier_slices import conjugate_share, processors
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
 
@@ -158,7 +158,7 @@ class SliceReader:
         kept = (np.hypot(m1, m2) <= reach) & ((m2 > 0) | ((m2 == 0) & (m1 >= 0)))
         self._rows, self._columns = m2[kept] % edge, m1[kept] % edge
         self.k = 2 * np.pi / voxels * np.stack([m1[kept], m2[kept]], axis=1)
-        self.share = np.where((self.k == 0).all(axis=1), 1.0, 2.0)
+        self.share = conjugate_share(self.k)
         self.scale = 1 / (edge * survey.noise)
         self._noise = np.full(len(frames), np.nan)
 
