@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import trapcli
 from trapcli.config import from_dict
-from trapcli.motion.fourier_slices import processors
+from trapcli.motion.threads import processors
 from trapcli.reconstruction.alignment import align
 from trapcli.reconstruction.coverage import LIMITED, cover
 from trapcli.reconstruction.geometry import Detector, angle_blocks, astra_blocks, npz, relion_blocks

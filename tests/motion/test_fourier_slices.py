@@ -10,7 +10,6 @@ from trapcli.motion.fourier_slices import (
     NormalOperator,
     back_project,
     circulant_density,
-    processors,
     project,
     slice_points,
 )
@@ -75,10 +74,3 @@ def test_density_of_lattice_frequencies_seen_evenly():
     points = [axis.ravel() for axis in np.meshgrid(frequency, frequency, frequency, indexing="ij")]
     kernel = back_project(points, np.full(n**3, weight, complex), 2 * n)
     np.testing.assert_allclose(circulant_density(kernel), weight * n**3, rtol=1e-6)
-
-
-def test_threads(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    assert processors() == 3
-    monkeypatch.setenv("OMP_NUM_THREADS", "many")
-    assert processors() >= 1

@@ -7,13 +7,14 @@ frames are non-uniform Fourier transforms, and the normal operator is a convolut
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import finufft
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+
+from trapcli.motion.threads import processors
 
 Array = NDArray[np.float64]
 Real = NDArray[np.floating[Any]]
@@ -22,14 +23,6 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 _DOUBLE_PRECISION = 1e-13
 _SINGLE_PRECISION = 2e-5
 _SPARE = 1.25  # finer grid of the transforms in single precision, which saves memory
-
-
-def processors() -> int:
-    """Return how many threads to use: ``OMP_NUM_THREADS``, or what this process may."""
-    try:
-        return max(1, int(os.environ["OMP_NUM_THREADS"]))
-    except (KeyError, ValueError):
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def slice_points(R: Array, k: Array, spacing: float = 1.0) -> list[Array]:

@@ -15,19 +15,21 @@ minimized; their mean over the noise does not favour motions that see more.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import finufft
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from trapcli.motion.elimination import Eliminated, ObjectBlock
 from trapcli.motion.fourier_slices import back_project, conjugate_share, project, slice_points
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
+from trapcli.motion.threads import in_parallel, processors
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -35,12 +37,11 @@ ComplexArray = NDArray[np.complex128]
 _GUARD = 6.0  # half the gap between the band and its periodic image, times the object's radius
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
-_ROUGH_PRECISION = 1e-7  # where a step is only looked for
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
-_SHIFT_STEPS = 12  # of conjugate gradients
-_SHIFT_TOLERANCE = 1e-3  # gain of such a step, in units of the first one's, that ends them
 _CONVERGED = 0.1  # gain in misfit, in units of a noise's, that ends the search
+_AT_ONCE = 64  # frames whose waves on the lattice are held at once
+_CACHED = 256  # lattice points whose waves fit into a processor's cache
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,7 @@ class ObjectModel:
         self._mask = centred & (np.linalg.norm(cube, axis=-1) * self.spacing <= reach)
         self._index = cube[self._mask]
         self.position = self._index * self.spacing
+        self._half_index = self._index[: len(self._index) // 2 + 1]  # one point of each opposite pair
         radial = np.hypot(self.low.k[:, 0], self.low.k[:, 1])
         blob = np.exp(-0.5 * (_WIDTH * spacing * radial) ** 2)
         power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
@@ -143,10 +145,10 @@ class ObjectModel:
         self._gain = self._root * self._blob
         # places of differences and sums of lattice points among all, for one point of each opposite pair
         edge = 4 * self._half + 1
-        flat = self._index[: len(self._index) // 2 + 1] @ np.array([edge**2, edge, 1])
+        flat = self._half_index @ np.array([edge**2, edge, 1])
         middle = 2 * self._half * (edge**2 + edge + 1)
-        self._difference = (flat[:, None] - flat[None, :] + middle).astype(np.int32)
-        self._sum = (flat[:, None] + flat[None, :] + middle).astype(np.int32)
+        self._difference = flat[:, None] - flat[None, :] + middle
+        self._sum = flat[:, None] + flat[None, :] + middle
 
     @classmethod
     def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
@@ -191,38 +193,30 @@ class ObjectModel:
         values = spline.values(times)
         roughness = Roughness(spline, axes) if smooth else None
         bent = _coefficients(spline, axes)
-        low, shift = self.low, np.zeros((groups, 2))
-        hessian: Array | None = None
-        old = np.inf
-        views = self._views(path.R[-groups:])
+        now = self._tried(path, np.zeros((groups, 2)))
         for _ in range(steps):
-            moved = self._shift_step(views, self._state(views, low.modes))
-            shift, low = shift + moved, low.shifted(moved)
-            state = self._state(views, low.modes)
-            gradient = np.einsum("gki,gk->gi", state.slopes[..., :3].conj(), state.residual).real
-            gradient -= 0.5 * self._seen_slopes(views)
-            downhill = (values.T @ gradient).ravel()[bent]
-            fresh = hessian is None
-            if hessian is None:
-                curvature = self._eliminated(views, state, values).hessian
-                hessian = _pinned(curvature, path.R[-groups:], values)[np.ix_(bent, bent)]
-                if roughness is not None:
-                    # far from the motion the misfit is large, and must not call for wiggles
-                    excess = max(1.0, state.cost / self._degrees(groups))
-                    roughness = roughness.weighed(hessian / excess, downhill / excess, path, groups)
-                    roughness = replace(roughness, weight=excess * roughness.weight)
-                    hessian += roughness.curvature(path, groups)
+            state = self._linearized(now.views, now.modes, now.solution)
+            eliminated = self._eliminated(now.views, state, values)
+            downhill, still = self._downhill(now.views, state, eliminated, values)
+            hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
+            downhill = downhill[bent]
             if roughness is not None:
-                downhill -= roughness.uphill(path, groups)
+                # far from the motion the misfit is large, and must not call for wiggles
+                excess = max(1.0, state.cost / self._degrees(groups))
+                roughness = roughness.weighed(hessian / excess, downhill / excess, now.path, groups)
+                roughness = replace(roughness, weight=excess * roughness.weight)
+                hessian += roughness.curvature(now.path, groups)
+                downhill -= roughness.uphill(now.path, groups)
             step = np.zeros((spline.size, 3))
             step.flat[bent] = np.linalg.solve(hessian, downhill)
-            gain, path, views = self._search(path, views, low, spline, step, state.cost, roughness)
-            if gain < _CONVERGED and fresh:
+            follow = self._follow(
+                now.views, state, eliminated, values @ step, eliminated.solution @ step.ravel()
+            )
+            gain, now = self._search(now, spline, step, still, follow, roughness)
+            if gain < _CONVERGED:
                 break
-            if gain > 0.3 * old or gain < _CONVERGED:
-                hessian = None
-            old = gain
-        return Fit(path, low, shift, spline, self._cost(views, low.modes), roughness, axes)
+        low, cost = self.low.shifted(now.shift), now.solution.cost
+        return Fit(now.path, low, now.shift, spline, cost, roughness, axes)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -298,21 +292,22 @@ class ObjectModel:
         arm = (self.position - middle) / state.amplitude.sum()
         lever = np.stack([np.concatenate(_folded(column)) for column in arm.T], axis=1)
         flat = covariance.reshape(2 * (3 * values.shape[1],))
-        first: tuple[Array, Array] | None = None
+        first: list[Array] = []
         errors = np.zeros((len(values), 2))
-        for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
-            column = self._back_projected(rotation, slopes[:, 3:] * self._gain[g, :, None])
+        for part in _parts(len(values)):
+            R, column = views.R[part], self._shift_columns(views, state, part)
             # the centre is the shift and the middle, which follow the object and the motion
-            followed = lever @ rotation[:, :2] - column @ eliminated.shift_covariance[g]
-            by_object = scipy.linalg.solve_triangular(
-                eliminated.factor, followed, lower=True, overwrite_b=True, check_finite=False
-            )
-            turned = cross_matrix(rotation.T @ middle)[:2] - eliminated.carry[g].T
-            by_motion = np.kron(values[g], turned) - by_object.T @ eliminated.half
-            first = first or (by_object, by_motion)
-            way, turn = by_object - first[0], by_motion - first[1]
-            errors[g] = np.sum(way**2, axis=0) + np.einsum("ip,pq,iq->i", turn, flat, turn, optimize=True)
-        return np.sqrt(errors)
+            pulled = lever @ R[:, :, :2] - column @ eliminated.shift_covariance[part]
+            turned = cross_matrix(middle @ R)[:, :2] - eliminated.carry[part].transpose(0, 2, 1)
+            by_object = pulled.transpose(1, 0, 2)
+            followed = eliminated.block.solve(by_object.reshape(len(by_object), -1)).reshape(by_object.shape)
+            by_motion = np.einsum("gb,gij->gibj", values[part], turned).reshape(*turned.shape[:2], -1)
+            by_motion -= np.einsum("ngi,np->gip", by_object, eliminated.solution, optimize=True)
+            first = first or [by_object[:, :1], followed[:, :1], by_motion[:1]]
+            way, answer, turn = by_object - first[0], followed - first[1], by_motion - first[2]
+            errors[part] = np.einsum("ngi,ngi->gi", way, answer)
+            errors[part] += np.einsum("gip,pq,giq->gi", turn, flat, turn, optimize=True)
+        return np.sqrt(np.maximum(errors, 0.0))
 
     # ------------------------------------------------------------------ one motion
 
@@ -331,19 +326,18 @@ class ObjectModel:
         even[:, -1] *= np.sqrt(0.5)
         for block in (even, odd):
             block[np.diag_indices(len(block))] += 1.0
-        factors = [scipy.linalg.cholesky(block, lower=True, check_finite=False) for block in (even, odd)]
-        halves = [scipy.linalg.lapack.dtrtri(factor, lower=True)[0] for factor in factors]
+        factors, halves = zip(*in_parallel(_factored, (even, odd)), strict=True)
         # not the trace of N⁻¹ A Aᵀ, of which rounding would leave little
         seen = float(sum(len(half) - np.sum(half**2) for half in halves))
-        return _Views(R, points, (even, odd), factors, seen)
+        return _Views(R, points, [even, odd], list(factors), list(halves), seen)
 
     def _seen_slopes(self, views: _Views) -> Array:
         """Return the ``(G, 3)`` derivatives of ``views.seen`` by small rotations ε, ``R → R exp([ε]×)``.
 
         d tr(1 − N⁻¹) = tr(N⁻² dN), a sum over differences of lattice points.
         """
-        even, odd = (_symmetric_inverse(factor) for factor in views.factors)
-        even, odd = even @ even, np.pad(odd @ odd, (0, 1))
+        even, odd = in_parallel(_inverse_square, views.halves)
+        odd = np.pad(odd, (0, 1))
         even[-1] *= np.sqrt(0.5)
         even[:, -1] *= np.sqrt(0.5)
         edge = 4 * self._half + 1
@@ -370,21 +364,27 @@ class ObjectModel:
         values = project(points, volume)
         return np.asarray(self._blob * values.reshape(len(amplitudes), -1, len(self._blob)))
 
+    def _tried(self, path: Path, shift: Array) -> _Tried:
+        views = self._views(path.R[-len(shift) :])
+        modes = self.low.shifted(shift).modes
+        return _Tried(path, shift, views, modes, self._solved(views, modes))
+
     def _cost(self, views: _Views, modes: ComplexArray) -> float:
-        parts = _folded(self._right(views, self._root * modes))
-        gains = [
-            scipy.linalg.solve_triangular(factor, part, lower=True, check_finite=False)
-            for factor, part in zip(views.factors, parts, strict=True)
-        ]
-        return self._square(modes) - float(sum(gain @ gain for gain in gains))
+        return self._solved(views, modes).cost
+
+    def _solved(self, views: _Views, modes: ComplexArray) -> _Solution:
+        right = self._right(views, self._root * modes)
+        amplitude = views.solve(right)
+        return _Solution(amplitude, self._square(modes) - float(right @ amplitude))
 
     def _state(self, views: _Views, modes: ComplexArray) -> _State:
         """Solve for the object; return what the gradient needs."""
-        right = self._right(views, self._root * modes)
-        amplitude = views.solve(right)
-        model, slopes = self._model(views.R, views.points, amplitude)
-        cost = self._square(modes) - float(right @ amplitude)
-        return _State(amplitude, (modes - model) * self._root, slopes * self._root[..., None], cost)
+        return self._linearized(views, modes, self._solved(views, modes))
+
+    def _linearized(self, views: _Views, modes: ComplexArray, solution: _Solution) -> _State:
+        model, slopes = self._model(views.R, views.points, solution.amplitude)
+        residual = (modes - model) * self._root
+        return _State(solution.amplitude, residual, slopes * self._root[..., None], solution.cost)
 
     def _middle(self, state: _State) -> Array:
         return np.asarray(state.amplitude @ self.position / state.amplitude.sum())
@@ -397,153 +397,171 @@ class ObjectModel:
         shifts = np.stack([-1j * k1 * model, -1j * k2 * model], axis=-1)
         return model, np.concatenate([slopes, shifts], axis=-1)
 
-    def _shift_step(self, views: _Views, state: _State) -> Array:
-        """Return the shifts that lessen the misfit most while the object follows, by conjugate gradients.
+    def _downhill(
+        self, views: _Views, state: _State, eliminated: Eliminated, values: Array
+    ) -> tuple[Array, Array]:
+        """Return half the gradient, ``(P,)``, and ``(G, 2)`` shifts, where the object and the shifts follow.
 
-        With the object held the shifts would creep, as the object has been fitted to frames out of place.
+        The shifts are those that lessen the misfit most while the motion stays.
         """
-        slopes = state.slopes[..., 3:]
-        covariance = _shift_covariance(slopes)
-        lattice = _Lattice(views.points, self._mask)
+        gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
+        turning, shifting = gradient[:, :3] - 0.5 * self._seen_slopes(views), gradient[:, 3:]
+        turning -= np.einsum("gij,gj->gi", eliminated.carry, shifting)
+        alone = np.einsum("gij,gj->gi", eliminated.shift_covariance, shifting)
+        pull = self._right(views, np.einsum("gki,gi->gk", state.slopes[..., 3:], alone))
+        pull = np.concatenate(_folded(pull))
+        downhill = (values.T @ turning).ravel() + pull @ eliminated.solution
+        answer = eliminated.block.solve(pull[:, None])[:, 0]
+        still = alone + self._follow(views, state, eliminated, np.zeros((len(values), 3)), answer)
+        return downhill, _without_drift(still, views.R)
 
-        def curved(shift: Array) -> Array:
-            moved = np.einsum("gki,gi->gk", slopes, shift)
-            right = lattice.gathered(self._gain * moved)
-            moved -= self._gain * lattice.waves(views.solve(right)).reshape(moved.shape)
-            return np.asarray(np.einsum("gki,gk->gi", slopes.conj(), moved).real)
-
-        shift = np.zeros(slopes.shape[::2])
-        downhill = np.einsum("gki,gk->gi", slopes.conj(), state.residual).real
-        direction = step = np.einsum("gij,gj->gi", covariance, downhill)
-        gain = first = float(np.sum(downhill * step))
-        for _ in range(_SHIFT_STEPS):
-            if not gain > _SHIFT_TOLERANCE * first:
-                break
-            image = curved(direction)
-            bend = float(np.sum(direction * image))
-            if not bend > 0:
-                break
-            length = gain / bend
-            shift = shift + length * direction
-            downhill = downhill - length * image
-            step = np.einsum("gij,gj->gi", covariance, downhill)
-            old, gain = gain, float(np.sum(downhill * step))
-            direction = step + gain / old * direction
-        return shift
+    def _follow(
+        self, views: _Views, state: _State, eliminated: Eliminated, turn: Array, answer: Array
+    ) -> Array:
+        """Return the ``(G, 2)`` shifts that follow ``(G, 3)`` turns and minus an ``(n,)`` folded object."""
+        waves = self._gain * self._waves(views.points, [_unfolded(answer)])[0] / self._blob
+        pull = np.einsum("gki,gk->gi", state.slopes[..., 3:].conj(), waves).real
+        pull = np.einsum("gij,gj->gi", eliminated.shift_covariance, pull)
+        return _without_drift(pull - np.einsum("gji,gj->gi", eliminated.carry, turn), views.R)
 
     def _search(
         self,
-        path: Path,
-        views: _Views,
-        low: LowBand,
+        now: _Tried,
         spline: Spline,
         step: Array,
-        cost: float,
+        still: Array,
+        follow: Array,
         roughness: Roughness | None,
-    ) -> tuple[float, Path, _Views]:
+    ) -> tuple[float, _Tried]:
         """Return the gain of the Newton step, shortened until it helps, and where it leads to."""
-        groups = len(low.time)
 
-        def rough(path: Path) -> float:
-            return 0.0 if roughness is None else roughness.penalty(path, groups)
+        def total(tried: _Tried) -> float:
+            rough = 0.0 if roughness is None else roughness.penalty(tried.path, len(still))
+            return tried.solution.cost + tried.views.seen + rough
 
-        old = cost + views.seen + rough(path)
-        for _ in range(6):
-            tried = path.bent(spline, step)
-            seen = self._views(tried.R[-groups:])
-            gain = old - self._cost(seen, low.modes) - seen.seen - rough(tried)
+        old = total(now)
+        for length in 0.25 ** np.arange(6):
+            tried = self._tried(now.path.bent(spline, length * step), now.shift + still + length * follow)
+            gain = old - total(tried)
             if gain > 0:
-                return gain, tried, seen
-            step = step / 4
-        return 0.0, path, views
+                return gain, tried
+        return 0.0, now
 
-    def _eliminated(self, views: _Views, state: _State, values: Array) -> _Eliminated:
+    def _eliminated(self, views: _Views, state: _State, values: Array) -> Eliminated:
         """Eliminate the object and the shifts from the normal equations of a motion."""
         curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
         inverse = _shift_covariance(state.slopes[..., 3:])
         carry = curvature[:, :3, 3:] @ inverse
         own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
         root = np.linalg.cholesky(inverse)
-        size = values.shape[1]
-        coupling = np.zeros((size, len(self.position), 3))
-        reduced = scipy.linalg.block_diag(*views.blocks)
-        stack: list[Array] = []
-        for g, (rotation, slopes) in enumerate(zip(views.R, state.slopes, strict=True)):
-            column = self._back_projected(rotation, slopes * self._gain[g, :, None])
-            turned = column[:, :3] - column[:, 3:] @ carry[g].T
-            for b in np.flatnonzero(values[g]):
-                coupling[b] += values[g, b] * turned
-            stack.append(column[:, 3:] @ root[g])
-            if len(stack) == 256 or g == len(views.R) - 1:
-                shifts = np.concatenate(stack, axis=1)
-                reduced -= shifts @ shifts.T
-                stack = []
-        factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
-        flat = coupling.transpose(1, 0, 2).reshape(len(reduced), -1)
-        half = scipy.linalg.solve_triangular(factor, flat, lower=True, overwrite_b=True, check_finite=False)
-        direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
-        return _Eliminated(direct - half.T @ half, factor, half, inverse, carry)
+        size, points = values.shape[1], len(self.position)
+        coupling = np.zeros((size, points, 3))
 
-    def _back_projected(self, rotation: Array, modes: ComplexArray) -> Array:
-        """Return ``Re Σ_k exp(i⟨R k, b⟩) modes`` on the lattice, folded, ``(n, C)`` for ``(K, C)`` modes."""
-        phase = self.position[: len(self.position) // 2 + 1] @ (rotation[:, :2] @ self.low.k.T)
-        even, odd = np.cos(phase) @ modes.real, -np.sin(phase[:-1]) @ modes.imag
-        even[-1] *= np.sqrt(0.5)
-        return np.asarray(np.sqrt(2) * np.concatenate([even, odd]))
+        def shifts() -> Iterator[Array]:
+            for part in _parts(len(values)):
+                column = self._back_projected(views.R[part], state.slopes[part] * self._gain[part, :, None])
+                turned = column[..., :3] - column[..., 3:] @ carry[part].transpose(0, 2, 1)
+                met = np.flatnonzero(values[part].any(axis=0))
+                coupling[met] += np.tensordot(values[part][:, met], turned, (0, 0))
+                alone = column[..., 3:] @ root[part]
+                yield np.asfortranarray(alone.transpose(1, 0, 2).reshape(points, -1))
+
+        block = ObjectBlock(views.blocks, views.factors, shifts(), 2 * len(values))
+        flat = coupling.transpose(1, 0, 2).reshape(points, -1)
+        solution = block.solve(flat)
+        direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
+        return Eliminated(direct - flat.T @ solution, solution, block, inverse, carry)
+
+    def _shift_columns(self, views: _Views, state: _State, part: slice) -> Array:
+        return self._back_projected(views.R[part], state.slopes[part, :, 3:] * self._gain[part, :, None])
+
+    def _back_projected(self, R: Array, modes: ComplexArray) -> Array:
+        """Return ``(g, n, C)`` sums ``Re Σ_k exp(i⟨R k, b⟩) modes`` of ``(g, K, C)`` modes, folded."""
+        share = min(processors(), len(R))
+        parts = in_parallel(
+            self._back_projected_alone, np.array_split(R, share), np.array_split(modes, share)
+        )
+        return np.concatenate(parts)
+
+    def _back_projected_alone(self, R: Array, modes: ComplexArray) -> Array:
+        count = len(self._half_index)
+        i1, i2, i3 = (self._half_index + self._half).T
+        folded = np.empty((len(R), 2 * count - 1, modes.shape[-1]))
+        both = np.empty((2, count, modes.shape[-1]))
+        for n, rotation in enumerate(R):
+            # exp(i⟨R k, b⟩) is a product of powers, one for each axis
+            unit = np.exp(1j * self.spacing * (rotation[:, :2] @ self.low.k.T))
+            up = np.cumprod(np.broadcast_to(unit, (self._half, *unit.shape)), axis=0)
+            power = np.concatenate([up[::-1].conj(), np.ones_like(up[:1]), up]).transpose(1, 0, 2)
+            real, imaginary = modes[n].real.copy(), modes[n].imag.copy()
+            for start in range(0, count, _CACHED):
+                here = slice(start, start + _CACHED)
+                wave = power[0].take(i1[here], axis=0)
+                wave *= power[1].take(i2[here], axis=0)
+                wave *= power[2].take(i3[here], axis=0)
+                np.matmul(wave.real.copy(), real, out=both[0, here])
+                np.matmul(wave.imag.copy(), imaginary, out=both[1, here])
+            folded[n, :count] = np.sqrt(2) * both[0]
+            folded[n, count - 1] = both[0, -1]
+            folded[n, count:] = -np.sqrt(2) * both[1, :-1]
+        return folded
 
 
 @dataclass(frozen=True)
 class _Views:
     """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix.
 
-    The matrix is of folded amplitudes, an even block and an odd one. `seen` is how many amplitudes the frames
-    determine.
+    The matrix is of folded amplitudes, an even block and an odd one; with lower Cholesky factors and their
+    inverses. `seen` is how many amplitudes the frames determine.
     """
 
     R: Array
     points: list[Array]
-    blocks: tuple[Array, Array]
+    blocks: list[Array]
     factors: list[Array]
+    halves: list[Array]
     seen: float
 
     def solve(self, right: Array) -> Array:
         """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""
-        even, odd = (
+        parts = [
             scipy.linalg.cho_solve((factor, True), part, check_finite=False)
             for factor, part in zip(self.factors, _folded(right), strict=True)
-        )
-        opposite = np.sqrt(0.5) * np.stack([even[:-1] + odd, even[:-1] - odd])
-        return np.concatenate([opposite[0], even[-1:], opposite[1, ::-1]])
+        ]
+        return _unfolded(np.concatenate(parts))
 
 
 @dataclass(frozen=True)
-class _Eliminated:
-    """What eliminating the object and the shifts leaves of the normal equations, and what it took.
+class _Solution:
+    """The object that fits a motion best, as ``(n,)`` amplitudes, and the misfit that it leaves."""
 
-    Attributes
-    ----------
-    hessian:
-        ``(3 · size, 3 · size)`` half the Hessian by the spline's coefficients.
-    factor:
-        ``(n, n)`` Cholesky factor of the folded object's block, the shifts eliminated.
-    half:
-        ``(n, 3 · size)`` its solution for the coupling of object and motion.
-    shift_covariance, carry:
-        ``(G, 2, 2)`` covariance of the shifts for a known object; ``(G, 3, 2)`` the coupling of rotations and
-        shifts, times it.
-    """
-
-    hessian: Array
-    factor: Array
-    half: Array
-    shift_covariance: Array
-    carry: Array
+    amplitude: Array
+    cost: float
 
 
-def _symmetric_inverse(factor: Array) -> Array:
-    """Return the inverse of a matrix from its lower Cholesky factor."""
-    lower = np.tril(scipy.linalg.lapack.dpotri(factor, lower=True)[0])
-    return np.asarray(lower + np.tril(lower, -1).T)
+@dataclass(frozen=True)
+class _Tried:
+    """A motion with shifts, the modes that these have moved, and the object that fits them."""
+
+    path: Path
+    shift: Array
+    views: _Views
+    modes: ComplexArray
+    solution: _Solution
+
+
+def _factored(block: Array) -> tuple[Array, Array]:
+    """Return the lower Cholesky factor of a matrix and the factor's inverse."""
+    factor = scipy.linalg.cholesky(block, lower=True, check_finite=False)
+    return factor, scipy.linalg.lapack.dtrtri(factor, lower=True)[0]
+
+
+def _inverse_square(half: Array) -> Array:
+    """Return the square of the inverse of a matrix, from the inverse of its lower Cholesky factor."""
+    lower, _ = scipy.linalg.lapack.dlauum(half, lower=True)
+    inverse = np.tril(lower) + np.tril(lower, -1).T
+    square = scipy.linalg.blas.dsyrk(1.0, inverse, lower=True)
+    return np.asarray(np.tril(square) + np.tril(square, -1).T)
 
 
 def _turning(R: Array, k: Array, gradient: NDArray[Any]) -> NDArray[Any]:
@@ -567,30 +585,27 @@ def _folded(lattice: Array) -> tuple[Array, Array]:
     return even, np.sqrt(0.5) * (first - opposite)
 
 
+def _unfolded(parts: Array) -> Array:
+    """Return numbers on the lattice from their even part, followed by the odd one."""
+    half = len(parts) // 2
+    even, odd = parts[:half], parts[half + 1 :]
+    opposite = np.sqrt(0.5) * np.stack([even + odd, even - odd])
+    return np.concatenate([opposite[0], parts[half : half + 1], opposite[1, ::-1]])
+
+
+def _without_drift(shift: Array, R: Array) -> Array:
+    """Return ``(G, 2)`` shifts without those that a shift of the object undoes: steps would creep there."""
+    drift = R[:, :, :2].transpose(0, 2, 1).reshape(-1, 3)
+    return shift - (drift @ np.linalg.lstsq(drift, shift.ravel(), rcond=None)[0]).reshape(shift.shape)
+
+
+def _parts(count: int) -> Iterator[slice]:
+    return (slice(start, start + _AT_ONCE) for start in range(0, count, _AT_ONCE))
+
+
 def _coefficients(spline: Spline, axes: tuple[int, ...]) -> NDArray[np.intp]:
     """Return the places of the coefficients of some axes among all."""
     return (3 * np.arange(spline.size)[:, None] + axes).ravel()
-
-
-class _Lattice:
-    """Sums over the lattice and over the frames, many times for the same orientations, roughly."""
-
-    def __init__(self, points: list[Array], mask: NDArray[np.bool_]) -> None:
-        self._mask = mask
-        self._up = finufft.Plan(1, mask.shape, eps=_ROUGH_PRECISION, isign=1)
-        self._down = finufft.Plan(2, mask.shape, eps=_ROUGH_PRECISION, isign=-1)
-        self._up.setpts(*points)
-        self._down.setpts(*points)
-
-    def gathered(self, values: ComplexArray) -> Array:
-        """Return ``(n,)`` sums over the frames' modes."""
-        return np.asarray(self._up.execute(values.ravel()).real[self._mask])
-
-    def waves(self, amplitude: Array) -> ComplexArray:
-        """Return the modes, flat, of ``(n,)`` amplitudes."""
-        volume = np.zeros(self._mask.shape, complex)
-        volume[self._mask] = amplitude
-        return np.asarray(self._down.execute(volume))
 
 
 @dataclass(frozen=True)

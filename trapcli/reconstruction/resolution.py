@@ -9,7 +9,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from trapcli.motion.fourier_slices import processors
+from trapcli.motion.threads import processors
 
 Array = NDArray[np.float64]
 

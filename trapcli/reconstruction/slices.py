@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from trapcli.errors import InputError
 from trapcli.motion.centers import object_radius, pixel_noise, sample_frames
-from trapcli.motion.fourier_slices import conjugate_share, processors
+from trapcli.motion.fourier_slices import conjugate_share
+from trapcli.motion.threads import processors
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
 

@@ -21,9 +21,9 @@ from trapcli.motion.fourier_slices import (
     NormalOperator,
     back_project,
     circulant_density,
-    processors,
     slice_points,
 )
+from trapcli.motion.threads import processors
 from trapcli.reconstruction.slices import SliceReader
 
 Array = NDArray[np.float64]

@@ -1,0 +1,97 @@
+"""What eliminating an object and the frames' shifts leaves of the normal equations of a motion.
+
+The unknowns are x, which bends the motion, two shifts of each frame, and the amplitudes of the object. A
+shift meets one frame only, so that the shifts go first (Schur complement); then the object.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from trapcli.motion.threads import in_parallel
+
+Array = NDArray[np.float64]
+
+
+class ObjectBlock:
+    """The object's normal matrix with the shifts eliminated, ``N − S Sᵀ``.
+
+    With few shifts they are the smaller side (Woodbury), with many the object is.
+
+    Parameters
+    ----------
+    blocks, factors:
+        N, block-diagonal, n × n in all, and lower Cholesky factors of its blocks.
+    parts:
+        S in parts of ``(n, any)`` columns.
+    count:
+        Columns of S in all.
+    """
+
+    def __init__(self, blocks: list[Array], factors: list[Array], parts: Iterable[Array], count: int) -> None:
+        self._rest: Array | None = None
+        if count < sum(len(block) for block in blocks):
+            self._factors = factors
+            self._leaning = self._forward(np.concatenate(list(parts), axis=1))
+            rest = np.eye(count) - self._leaning.T @ self._leaning
+            # a shift of all frames that the object follows leaves nothing but the object's own prior
+            rest[np.diag_indices(count)] += 1e-14
+            self._rest = scipy.linalg.cholesky(rest, lower=True, overwrite_a=True, check_finite=False)
+            return
+        reduced = np.asfortranarray(scipy.linalg.block_diag(*blocks))
+        for part in parts:
+            reduced = scipy.linalg.blas.dsyrk(-1.0, part, 1.0, reduced, lower=True, overwrite_c=True)
+        self._factors = [scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)]
+
+    def solve(self, right: Array) -> Array:
+        """Return ``(n, C)`` (N − S Sᵀ)⁻¹ times ``(n, C)`` columns."""
+        half = self._forward(right)
+        if self._rest is not None:
+            half += self._leaning @ scipy.linalg.cho_solve(
+                (self._rest, True), self._leaning.T @ half, check_finite=False
+            )
+        return self._triangular(half, transposed=True)
+
+    def _forward(self, right: Array) -> Array:
+        return self._triangular(right, transposed=False)
+
+    def _triangular(self, right: Array, transposed: bool) -> Array:
+        ends = np.cumsum([len(factor) for factor in self._factors])[:-1]
+
+        def solved(factor: Array, part: Array) -> Array:
+            return np.asarray(
+                scipy.linalg.solve_triangular(
+                    factor, part, lower=True, trans=int(transposed), check_finite=False
+                )
+            )
+
+        return np.concatenate(in_parallel(solved, self._factors, np.split(right, ends)))
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """Normal equations of a motion, without object and shifts.
+
+    Attributes
+    ----------
+    hessian:
+        ``(P, P)`` half the Hessian of the misfit by x.
+    solution:
+        ``(n, P)`` by how much the object follows x, with the sign changed; the shifts follow too.
+    block:
+        The object's own normal matrix.
+    shift_covariance, carry:
+        ``(G, 2, 2)`` covariance of the shifts for a known object; ``(G, 3, 2)`` the coupling of rotations and
+        shifts, times it.
+    """
+
+    hessian: Array
+    solution: Array
+    block: ObjectBlock
+    shift_covariance: Array
+    carry: Array
