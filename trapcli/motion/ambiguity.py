@@ -127,16 +127,17 @@ def _least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:
 def _axis_of_revolution(model: ObjectModel, R: Array, axes: Array) -> Array | None:
     """Return the axis near the first of `axes` where spin is seen least, if far less than about others."""
     least = model.cost(R, model.low.modes)
-    ramp = np.linspace(-0.5, 0.5, len(R)) * _SMALL_SPIN
+    ramp = np.linspace(-0.5, 0.5, len(R))
 
-    def resistance(axis: Array) -> float:
-        return model.cost(_about(axis, ramp) @ R, model.low.modes) - least
+    def resistance(axis: Array, spin: float = _SMALL_SPIN) -> float:
+        return model.cost(_about(axis, spin * ramp) @ R, model.low.modes) - least
 
     def near(tangent: Array) -> Array:
         axis = axes[0] + tangent @ axes[1:]
         return np.asarray(axis / np.linalg.norm(axis))
 
-    if resistance(axes[0]) > _WEAK * resistance(axes[1]):
+    # what is seen from few sides only resists a small spin about the optical axis alone
+    if any(resistance(axes[0], spin) > _WEAK * resistance(axes[1], spin) for spin in (_SMALL_SPIN, _SPIN)):
         return None
     simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1.0, "maxfev": 60}
