@@ -22,6 +22,19 @@ def test_known_digests(tmp_path):
     assert checksum_line(tmp_path / "abc", "-") == f"{ABC}  -"
 
 
+def test_a_checksum_no_longer_wanted_is_left_off(tmp_path):
+    path = tmp_path / "long"
+    path.write_bytes(bytes(5 << 20))
+    asked = []
+
+    def wanted():
+        asked.append(True)
+        return len(asked) < 3
+
+    checksum_line(path, wanted=wanted)
+    assert len(asked) == 3
+
+
 def test_folders_stand_for_their_files(tmp_path):
     (tmp_path / "stack" / "b").mkdir(parents=True)
     for name in ("b/2.tif", "b/10.tif", "a.tif"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -103,14 +104,17 @@ def _estimate(job: Job, progress: Callable[[str, int, int], None] | None) -> Out
     from trapcli.stack import open_stack
 
     frames = open_stack(job.source, job.config.input)
-    motion = estimate(frames, config=job.config, progress=progress)
-    motion = replace(motion, provenance=motion.provenance | _origin(job, frames))
-    motion.save(job.output, overwrite=job.overwrite)
+    with _checksums(job, frames) as checksums:
+        motion = estimate(frames, config=job.config, progress=progress)
+    origin = {"command_line": job.command_line, "inputs": checksums()}
+    replace(motion, provenance=motion.provenance | origin).save(job.output, overwrite=job.overwrite)
     return _outcome(job, motion)
 
 
-def _origin(job: Job, frames: Frames) -> dict[str, str]:
-    """Return the command line and the checksums of the files that were read."""
+@contextlib.contextmanager
+def _checksums(job: Job, frames: Frames) -> Iterator[Callable[[], str]]:
+    """Take the checksums of the files that are read while the block runs; yield what returns their lines."""
+    from trapcli.motion.threads import processors
     from trapcli.result import provenance
     from trapcli.stack import open_stack
 
@@ -122,8 +126,22 @@ def _origin(job: Job, frames: Frames) -> dict[str, str]:
     for path in given * (not preprocess.attenuation):
         files = (*files, *open_stack(path).info.files)
     names = (STANDARD_INPUT if job.source == STANDARD_INPUT else "", *[""] * len(files))
-    lines = [provenance.checksum_line(file, name) for file, name in zip(files, names, strict=False)]
-    return {"command_line": job.command_line, "inputs": "\n".join(lines)}
+    stopped = threading.Event()
+
+    def lines() -> str:
+        wanted = (lambda: not stopped.is_set(),) * len(files)
+        return "\n".join(map(provenance.checksum_line, files, names, wanted))
+
+    if processors() == 1:
+        yield lines
+        return
+    with ThreadPoolExecutor(1) as thread:
+        told = thread.submit(lines)
+        try:
+            yield told.result
+        except BaseException:
+            stopped.set()
+            raise
 
 
 def _outcome(job: Job, motion: Motion) -> Outcome:

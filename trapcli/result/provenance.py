@@ -6,13 +6,14 @@ import hashlib
 import importlib.metadata
 import os
 import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
 from trapcli.errors import InputError
 
 PROGRAM = "trap-motion"
+_BLOCK = 1 << 20  # bytes of a file that are read at once
 LIBRARIES = (
     "numpy",
     "scipy",
@@ -60,20 +61,24 @@ def collect(
     }
 
 
-def checksum_line(path: Path, name: str = "") -> str:
+def checksum_line(path: Path, name: str = "", wanted: Callable[[], bool] = lambda: True) -> str:
     r"""Return the line ``sha256sum`` writes for a file, which is read in blocks.
 
     Parameters
     ----------
     name:
         What to call the file, ``-`` for standard input that was stored in `path`; default: `path` itself.
+    wanted:
+        Asked before every block; once it is false, the rest of the file is left out.
     """
+    checksum = hashlib.sha256()
     try:
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        with path.open("rb", buffering=0) as file:
+            while wanted() and (block := file.read(_BLOCK)):
+                checksum.update(block)
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror or error})") from None
-    name = name or str(path)
+    name, digest = name or str(path), checksum.hexdigest()
     escaped = name.replace("\\", "\\\\").replace("\n", "\\n").replace("\r", "\\r")
     return f"{'' if escaped == name else chr(92)}{digest}  {escaped}"
 
