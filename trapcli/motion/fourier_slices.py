@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 Real = NDArray[np.floating[Any]]
 Complex = NDArray[np.complexfloating[Any, Any]]
 
-_DOUBLE_PRECISION = 1e-13
+_DOUBLE_PRECISION = 1e-12
 _SINGLE_PRECISION = 2e-5
 _SPARE = 1.25  # finer grid of the transforms in single precision, which saves memory
 

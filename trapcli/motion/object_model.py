@@ -197,7 +197,7 @@ class ObjectModel:
         for _ in range(steps):
             state = self._linearized(now.views, now.modes, now.solution)
             eliminated = self._eliminated(now.views, state, values)
-            downhill, still = self._downhill(now.views, state, eliminated, values)
+            downhill, still, hope = self._downhill(now.views, state, eliminated, values)
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
             downhill = downhill[bent]
             if roughness is not None:
@@ -209,6 +209,9 @@ class ObjectModel:
                 downhill -= roughness.uphill(now.path, groups)
             step = np.zeros((spline.size, 3))
             step.flat[bent] = np.linalg.solve(hessian, downhill)
+            hope += float(downhill @ step.flat[bent])
+            if hope < _CONVERGED:
+                break
             follow = self._follow(
                 now.views, state, eliminated, values @ step, eliminated.solution @ step.ravel()
             )
@@ -318,7 +321,7 @@ class ObjectModel:
         """Return what the orientations alone decide: where the frames look, and the normal matrix."""
         points = slice_points(R, self.low.k, self.spacing)
         density = (self._gain**2).ravel().astype(complex)
-        # the normal matrix spans ten orders of magnitude: it needs the transforms' double precision
+        # the normal matrix spans ten orders of magnitude, and so must the transforms
         kernel = back_project(points, density, 4 * self._half + 1).ravel()
         across, along = kernel[self._sum], kernel[self._difference]
         even, odd = along + across, (along - across)[:-1, :-1]
@@ -399,10 +402,10 @@ class ObjectModel:
 
     def _downhill(
         self, views: _Views, state: _State, eliminated: Eliminated, values: Array
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, float]:
         """Return half the gradient, ``(P,)``, and ``(G, 2)`` shifts, where the object and the shifts follow.
 
-        The shifts are those that lessen the misfit most while the motion stays.
+        The shifts are those that lessen the misfit most while the motion stays; by how much comes last.
         """
         gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
         turning, shifting = gradient[:, :3] - 0.5 * self._seen_slopes(views), gradient[:, 3:]
@@ -413,7 +416,7 @@ class ObjectModel:
         downhill = (values.T @ turning).ravel() + pull @ eliminated.solution
         answer = eliminated.block.solve(pull[:, None])[:, 0]
         still = alone + self._follow(views, state, eliminated, np.zeros((len(values), 3)), answer)
-        return downhill, _without_drift(still, views.R)
+        return downhill, _without_drift(still, views.R), float(np.sum(shifting * still))
 
     def _follow(
         self, views: _Views, state: _State, eliminated: Eliminated, turn: Array, answer: Array
