@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.motion.common_line import LineTable, choose_pairs
+from trapcli.motion.elimination import bent_blocks
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.path import Path, Spline, align, orthonormal
 
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 _PAIRS = 12  # pairs of frames a frame
-_SUPPORT = 4  # basis functions of a cubic spline that overlap
 _DISTINCT = np.deg2rad(3.0)  # mean angle between paths that are hypotheses of their own
 _REACH = 10  # groups added at each end at a time
 _SHORT = 120  # groups up to which every refinement takes the whole path
@@ -121,24 +121,9 @@ class Evidence:
             bent = np.einsum("gb,gui->ubi", values, coupling, optimize=True).reshape(-1, 3 * size)
             eliminated += bent.T @ np.linalg.solve(order.normal, bent)
         every = np.arange(groups)
-        across = _bent(values, s, t, scale * lines.hessian[:, :3, 3:])
-        hessian = _bent(values, every, every, own) + across + across.T - eliminated
+        across = bent_blocks(values, s, t, scale * lines.hessian[:, :3, 3:])
+        hessian = bent_blocks(values, every, every, own) + across + across.T - eliminated
         return hessian, (values.T @ gradient).ravel()
-
-
-def _bent(values: Array, s: Index, t: Index, blocks: Array) -> Array:
-    """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(3 · size, 3 · size)``, for ``(P, 3, 3)`` blocks."""
-    size = values.shape[1]
-    # at most four of the basis functions, consecutive ones, are not 0 at a time
-    first = np.minimum(np.argmax(values != 0, axis=1), size - _SUPPORT)
-    places = first[:, None] + np.arange(_SUPPORT)
-    local = np.take_along_axis(values, places, axis=1)
-    rows = 3 * places[s][:, :, None] + np.arange(3)
-    columns = 3 * places[t][:, :, None] + np.arange(3)
-    flat = rows[:, :, :, None, None] * (3 * size) + columns[:, None, None]
-    products = np.einsum("pb,pij,pc->pbicj", local[s], blocks, local[t], optimize=True)
-    total = np.bincount(flat.ravel(), products.ravel(), (3 * size) ** 2)
-    return np.asarray(total.reshape(3 * size, 3 * size), float)
 
 
 def find_branches(

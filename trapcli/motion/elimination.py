@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 from trapcli.motion.threads import in_parallel
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+_SUPPORT = 4  # basis functions of a cubic spline that overlap
 
 
 class ObjectBlock:
@@ -95,3 +99,18 @@ class Eliminated:
     block: ObjectBlock
     shift_covariance: Array
     carry: Array
+
+
+def bent_blocks(values: Array, s: Indices, t: Indices, blocks: Array) -> Array:
+    """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(3 · size, 3 · size)``, for ``(P, 3, 3)`` blocks."""
+    size = values.shape[1]
+    # at most four of the basis functions, consecutive ones, are not 0 at a time
+    first = np.minimum(np.argmax(values != 0, axis=1), size - _SUPPORT)
+    places = first[:, None] + np.arange(_SUPPORT)
+    local = np.take_along_axis(values, places, axis=1)
+    rows = 3 * places[s][:, :, None] + np.arange(3)
+    columns = 3 * places[t][:, :, None] + np.arange(3)
+    flat = rows[:, :, :, None, None] * (3 * size) + columns[:, None, None]
+    products = np.einsum("pb,pij,pc->pbicj", local[s], blocks, local[t], optimize=True)
+    total = np.bincount(flat.ravel(), products.ravel(), (3 * size) ** 2)
+    return np.asarray(total.reshape(3 * size, 3 * size), float)

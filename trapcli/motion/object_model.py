@@ -23,7 +23,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from trapcli.motion.elimination import Eliminated, ObjectBlock
+from trapcli.motion.elimination import Eliminated, ObjectBlock, bent_blocks
 from trapcli.motion.fourier_slices import back_project, conjugate_share, project, slice_points
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
@@ -472,7 +472,8 @@ class ObjectModel:
         block = ObjectBlock(views.blocks, views.factors, shifts(), 2 * len(values))
         flat = coupling.transpose(1, 0, 2).reshape(points, -1)
         solution = block.solve(flat)
-        direct = np.einsum("gb,gij,gc->bicj", values, own, values, optimize=True).reshape(3 * size, 3 * size)
+        every = np.arange(len(values))
+        direct = bent_blocks(values, every, every, own)
         return Eliminated(direct - flat.T @ solution, solution, block, inverse, carry)
 
     def _shift_columns(self, views: _Views, state: _State, part: slice) -> Array:
