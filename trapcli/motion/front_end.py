@@ -143,7 +143,8 @@ def _look(attenuation: Frames) -> _Look:
     noise, b = float(np.median(noises)), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
     reach = b * object_radius(images, noise / b)
-    radius = b * object_radius(images, max(noise, _LEAST_VISIBLE * peak) / b)
+    faintest = _LEAST_VISIBLE * peak
+    radius = b * object_radius(images, max(noise, faintest) / b, faintest)
     return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, min(radius, reach))
 
 
