@@ -124,6 +124,16 @@ def test_what_is_attenuation_already_is_recognised(moving: np.ndarray) -> None:
         attenuation_of(moving + noise, "none")
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("background", ["auto", "none"])
+def test_light_that_has_hardly_a_logarithm_is_no_fault(dtype: type, background: str) -> None:
+    frames = np.zeros((9, SIZE, SIZE), dtype)
+    frames[:, ::2] = np.finfo(dtype).smallest_subnormal
+    frames[:, 1] = np.finfo(dtype).max
+    with pytest.raises(InputError, match="--attenuation"):
+        attenuation_of(frames, background)
+
+
 def test_dead_pixels_of_the_background_say_nothing(moving: np.ndarray, tmp_path: Path) -> None:
     light = np.full((SIZE, SIZE), 30_000.0)
     light[31, 5] = 0
@@ -183,6 +193,21 @@ def test_dark_level_must_be_one(moving: np.ndarray) -> None:
         to_attenuation(frames, PreprocessConfig(dark="-3"))
     with pytest.raises(InputError, match="nowhere"):
         to_attenuation(frames, PreprocessConfig(dark="nowhere.tif"))
+
+
+def test_large_frames_agree_with_their_pixels(moving: np.ndarray, tmp_path: Path) -> None:
+    rows, columns = np.mgrid[-1 : 1 : 8 * SIZE * 1j, -1 : 1 : 8 * SIZE * 1j]
+    light = 40_000 * (1 - 0.25 * (rows**2 + columns**2) + 0.1 * columns + 0.05 * rows)
+    light[7, 9] = 0  # dead, as in the frames
+    large = np.kron(moving[:12], np.ones((8, 8)))
+    frames = raw(large, light)
+    frames[:, 7, 9] = 0
+    large[:, 7, 9] = 0
+    for background in (saved(tmp_path / "empty.tif", light), "border"):
+        found = attenuation_of(frames, background)
+        shown = np.abs(found - large)
+        shown[:, 7, 9] *= background != "border"
+        assert shown.max() < 2e-4
 
 
 def test_overexposed_frames_are_left_out(moving: np.ndarray) -> None:

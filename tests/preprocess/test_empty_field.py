@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
-from trapcli.preprocess.surface import fit_empty_field
+from trapcli.preprocess.counts import Counts, Sample
+from trapcli.preprocess.surface import EmptyField, median_field
+from trapcli.preprocess.surface import fit_empty_field as fit_to_sample
 
 SIZE, FRAMES = 96, 64
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] - SIZE // 2
@@ -38,6 +42,10 @@ def stack(field: np.ndarray, light: np.ndarray | float = 0.0) -> np.ndarray:
     return (field + light - ellipse() + noise).astype(np.float32)
 
 
+def fit_empty_field(logs: np.ndarray) -> EmptyField:
+    return fit_to_sample(Sample(Counts(0.0, np.inf), np.exp(logs)))
+
+
 def deviation(found: np.ndarray, field: np.ndarray) -> np.ndarray:
     """Return the error but for its mean, which is the brightness of the frames."""
     free = np.hypot(ROWS, COLUMNS) > 40
@@ -68,14 +76,14 @@ def test_the_particle_itself_is_no_speck() -> None:
 
 
 def test_steady_light_is_not_tilted() -> None:
-    assert len(fit_empty_field(stack(uneven())).light.surface) == 1
+    assert not fit_empty_field(stack(uneven())).light.tilted
 
 
 def test_light_that_tilts_is_followed() -> None:
     frames = stack(uneven(), 0.02 * np.sin(np.arange(FRAMES) / 5)[:, None, None] * COLUMNS / (SIZE / 2))
     found = fit_empty_field(frames)
-    assert len(found.light.surface) == 3
-    evened = found.light.even(frames, found.log_light)
+    assert found.light.tilted
+    evened, _ = found.light.even(frames - found.log_light)
     free = np.hypot(ROWS, COLUMNS) > 40
     slopes = evened[:, free] @ COLUMNS[free] / np.sum(COLUMNS[free] ** 2)
     assert np.abs(slopes).max() * SIZE / 2 < 0.001
@@ -103,3 +111,48 @@ def test_what_drifts_with_the_particle_is_no_speck() -> None:
         image[:] = 0.3 * np.sqrt(np.maximum(1 - square / 30**2, 0)) + 0.3 * np.exp(-square / (2 * 3.5**2))
     frames = uneven() - carried + NOISE * np.random.default_rng(3).standard_normal(carried.shape)
     assert fit_empty_field(frames.astype(np.float32)).specks == 0
+
+
+def enlarged(image: np.ndarray, times: int) -> np.ndarray:
+    """Return an image with `times` as many rows and columns, and one more of each."""
+    return np.pad(np.kron(image, np.ones((times, times))), ((0, 1), (0, 1)), mode="edge")
+
+
+def counted(logs: np.ndarray) -> Sample:
+    """Return noisy camera counts of some frames."""
+    light = np.random.default_rng(2).poisson(np.exp(logs - logs.max()) * 40_000)
+    return Sample(Counts(0.0, 65535.0), light.astype(np.uint16))
+
+
+@pytest.mark.slow
+def test_large_frames_are_looked_at_coarsely_but_specks_in_them_finely() -> None:
+    times, frames = 6, 24
+    field = enlarged(uneven(), times)
+    rows, columns = np.indices(field.shape) - len(field) // 2
+    beneath = np.log(1 - 0.4 * np.exp(-((rows - 20) ** 2 + (columns + 30) ** 2) / (2 * 1.5**2)))
+    beside = np.log(1 - 0.4 * np.exp(-((rows + 240) ** 2 + (columns + 240) ** 2) / (2 * 1.5**2)))
+    attenuation = ellipse()[:: FRAMES // frames][:frames]
+    sample = counted(np.array([field + beneath + beside - enlarged(image, times) for image in attenuation]))
+    tracemalloc.start()
+    found = fit_to_sample(sample)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10 * sample.images.nbytes
+    assert found.light.cells.binning == 4
+    assert found.specks == 1
+    free = np.hypot(rows, columns) > 40 * times
+    error = found.log_light - (field + beneath + beside)
+    error -= error[free].mean()
+    noise = 1 / np.sqrt(sample.images.mean())
+    assert np.abs(error).max() < 3 * noise
+    assert abs(error[~free].mean()) < 0.1 * noise
+
+
+def test_median_of_large_frames() -> None:
+    field = enlarged(uneven(), 6)
+    flicker = 0.05 * np.sin(7 * np.arange(15))[:, None, None]
+    logs = field + flicker + np.zeros((15, 1, 1))
+    for n, image in enumerate(logs):
+        image[25 * n : 25 * n + 100, 200:300] -= 1.0
+    error = median_field(counted(logs)) - field
+    assert error.std() < 0.6 / np.sqrt(20_000)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,25 @@ from numpy.typing import NDArray
 
 from trapcli.config import PreprocessConfig
 from trapcli.errors import InputError
-from trapcli.preprocess.counts import Counts, mean_image
+from trapcli.motion.cells import Cells
+from trapcli.preprocess.counts import Counts, Sample, mean_image, share
 from trapcli.preprocess.particle import Particle
-from trapcli.preprocess.surface import EmptyField, Light, border, fit_empty_field, median_field
+from trapcli.preprocess.surface import (
+    EmptyField,
+    Light,
+    averaged,
+    axes,
+    border,
+    coarse,
+    fit_empty_field,
+    grid,
+    median_field,
+)
 from trapcli.result.motion import Flag
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 _FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
 _LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
@@ -31,6 +42,8 @@ _COVERED = 0.01  # share of the pixels that may be free less often
 _RIVAL = 0.9  # share of the frames that show another particle, beyond which there are two
 _IMPRINT = 0.05  # darkness of a median where the particle stays, as a share of its depth, that shows it
 _FULL = 0.05  # share of free pixels below which little tells the empty field
+_COARSE = 256  # least cells across a frame, where it has as many pixels, in which the particle is looked for
+_LOOKS = 32  # frames that tell what the particle is like
 
 
 @dataclass(frozen=True)
@@ -40,8 +53,9 @@ class _Background:
     Attributes
     ----------
     attenuation:
-        Gives ``(H, W)`` log I₀ − log I for the logarithm of one frame's light, which it may overwrite; NaN
-        where I₀ isn't known.
+        Turns the ``(H, W)`` logarithm of one frame's light into log I₀ − log I, NaN in all pixels where I₀
+        isn't known in most, else 0 in those where it isn't; returns its means over the cells in which the
+        particle is looked for.
     keep_bright:
         Whether overexposed frames are kept, because most are.
     particle:
@@ -53,6 +67,26 @@ class _Background:
     warnings: tuple[str, ...] = ()
     keep_bright: bool = False
     particle: Particle | None = None
+
+    def project(self, logs: NDArray[Any], unknown: Bools | None) -> Flag | None:
+        """Turn ``(H, W)`` logarithms of light into attenuation of nothing but the particle; tell why not.
+
+        Parameters
+        ----------
+        unknown:
+            ``(H, W)`` pixels that tell nothing.
+        """
+        look = self.attenuation(logs)
+        if self.particle is None:
+            return None
+        cells = _cells(logs.shape)
+        foreign = self.particle.foreign(look if unknown is None else _known(logs, unknown, cells))
+        if isinstance(foreign, Flag):
+            return foreign
+        if foreign is not None:
+            mask = foreign.repeat(cells.binning, 0).repeat(cells.binning, 1)
+            logs[: mask.shape[0], : mask.shape[1]][mask] = 0
+        return None
 
 
 @dataclass(frozen=True)
@@ -109,29 +143,24 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
 
     left_out = np.zeros(len(frames), np.uint16)
 
-    def judged(image: NDArray[Any]) -> NDArray[Any] | Flag:
-        """Return one projection, or why there is none."""
-        light = counts.log_light(image, dtype)
-        spoilt = light.dark if background.keep_bright else light.dark | light.bright
-        if _share(spoilt) > _FLAGGED:
-            return Flag.BLANK if _share(light.dark) > _FLAGGED else Flag.SATURATED
-        attenuation = _attenuation(light.values, background).astype(dtype, copy=False)
-        return background.particle.alone(attenuation, light.dark) if background.particle else attenuation
-
-    def projection(position: int, image: NDArray[Any]) -> NDArray[Any]:
-        """Return one projection, NaN where there is none, and note why."""
-        found = judged(image)
-        if isinstance(found, Flag):
-            left_out[position] = found
-            return np.full(image.shape, np.nan, dtype)
-        return found
+    def project(position: int, image: NDArray[Any], out: NDArray[Any]) -> None:
+        """Write one projection to `out`, NaN where there is none, and note why."""
+        light = counts.log_light(image, out)
+        spoilt = light.dark if background.keep_bright else _either(light.dark, light.bright)
+        if share(spoilt) > _FLAGGED:
+            flag: Flag | None = Flag.BLANK if share(light.dark) > _FLAGGED else Flag.SATURATED
+        else:
+            flag = background.project(out, light.dark)
+        if flag is not None:
+            left_out[position] = flag
+            out[:] = np.nan
 
     def read_blocks(size: int) -> Iterator[NDArray[Any]]:
         done = 0
         for block in frames.read_blocks(size):
             projections = np.empty(block.shape, dtype)
             for n, image in enumerate(block):
-                projections[n] = projection(done + n, image)
+                project(done + n, image, projections[n])
             done += len(block)
             if np.count_nonzero(left_out == Flag.BLANK) > len(frames) / 2:
                 raise InputError(
@@ -141,7 +170,10 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
             yield projections
 
     def read_some(positions: NDArray[np.integer[Any]]) -> Iterator[NDArray[Any]]:
-        return (projection(n, image) for n, image in zip(positions, frames.pick(positions), strict=True))
+        for n, image in zip(positions, frames.pick(positions), strict=True):
+            projection = np.empty(image.shape, dtype)
+            project(n, image, projection)
+            yield projection
 
     info = replace(
         frames.info,
@@ -151,25 +183,26 @@ def to_attenuation(frames: Frames, config: PreprocessConfig, *, roi: tuple[int, 
     return Projections(frames.shape, dtype, frames.index, info, read_blocks, read_some, left_out=left_out)
 
 
-def _attenuation(logs: NDArray[Any], background: _Background) -> NDArray[Any]:
-    """Return log I₀ − log I, 0 in pixels of unknown background; NaN where that is unknown in most."""
-    attenuation = background.attenuation(logs)
-    unknown = np.isnan(attenuation)
-    if unknown.any():
-        attenuation[unknown] = np.nan if _share(unknown) > 0.5 else 0.0
-    return attenuation
+def _either(first: Bools | None, second: Bools | None) -> Bools | None:
+    return first | second if first is not None and second is not None else first if second is None else second
 
 
-def _share(mask: NDArray[np.bool_]) -> float:
-    return np.count_nonzero(mask) / mask.size
+def _cells(shape: tuple[int, ...]) -> Cells:
+    """Return the cells in which the particle is looked for."""
+    return Cells(shape, max(1, min(shape) // _COARSE))
+
+
+def _known(attenuation: NDArray[Any], unknown: Bools, cells: Cells) -> NDArray[Any]:
+    """Return means over cells; what is not known counts as empty."""
+    return cells.average(np.where(unknown, 0, attenuation))
 
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
-    sample = counts.sample(frames, _FLAGGED)
-    found = _with_particle(_find_background(frames, source, roi, counts, sample.logs), frames, sample.logs)
-    keep = sample.overexposed > 0.5
+    guessed = source in ("auto", "median", "surface")
+    sample = counts.sample(frames, _FLAGGED) if guessed else counts.sample(frames, _FLAGGED, _LOOKS)
+    found = _with_particle(_find_background(frames, source, roi, counts, sample), frames, sample)
     doubts = []
-    if keep:
+    if sample.keep_bright:
         doubts.append("most frames are overexposed, and what is thin can't be measured in them")
     elif sample.overexposed:
         doubts.append(f"about {max(0.01, sample.overexposed):.0%} of the frames are overexposed and left out")
@@ -177,21 +210,27 @@ def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Count
         doubts.append(
             f"about {max(0.01, sample.repeated):.0%} of the frames repeat the one before; times are wrong"
         )
-    return replace(found, warnings=(*found.warnings, *doubts), keep_bright=keep)
+    return replace(found, warnings=(*found.warnings, *doubts), keep_bright=sample.keep_bright)
 
 
-def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float32]) -> _Background:
+def _with_particle(found: _Background, frames: Frames, sample: Sample) -> _Background:
     """Add what the particle is like, and what is to be said of what else there is."""
-    # the logarithms have served their purpose, and are large
-    projections = [_attenuation(logs, found) for logs in sample[:: len(sample) // 32 or 1]]
-    particle = Particle.of(projections)
+    cells = _cells(frames.shape[1:])
+    some = replace(sample, images=sample.images[:: len(sample.images) // _LOOKS or 1])
+    looks = []
+    for logs in some.logs():
+        unknown = np.isnan(logs)
+        found.attenuation(logs)
+        if np.isfinite(logs).mean() > 0.5:
+            looks.append(_known(logs, unknown, cells))
+    particle = Particle.of(looks)
     if particle is None:
         return found
-    if np.mean([particle.has_rival(image) for image in projections]) > _RIVAL:
+    if np.mean([particle.has_rival(look) for look in looks]) > _RIVAL:
         raise InputError(f"{frames.info.source}: shows two particles that stay apart; choose one with --roi")
-    alone = [particle.alone(image) for image in projections]
-    spoilt = float(np.mean([isinstance(a, Flag) for a in alone]))
-    erased = float(np.mean([a is not b for a, b in zip(alone, projections, strict=True)])) - spoilt
+    foreign = [particle.foreign(look) for look in looks]
+    spoilt = float(np.mean([isinstance(one, Flag) for one in foreign]))
+    erased = float(np.mean([one is not None for one in foreign])) - spoilt
     doubts = []
     if spoilt:
         doubts.append(
@@ -204,21 +243,22 @@ def _with_particle(found: _Background, frames: Frames, sample: NDArray[np.float3
 
 
 def _find_background(
-    frames: Frames, source: str, roi: tuple[int, ...], counts: Counts, sample: NDArray[np.float32]
+    frames: Frames, source: str, roi: tuple[int, ...], counts: Counts, sample: Sample
 ) -> _Background:
+    shape = frames.shape[1:]
     if source == "border":
-        return _Background(partial(_above_border, degree=2), "background: a surface through the border")
+        return _Background(_above_border(shape, 2), "background: a surface through the border")
     if source == "none":
-        return _Background(partial(_above_border, degree=0), "background: none, a flat field")
+        return _Background(_above_border(shape, 0), "background: none, a flat field")
     if source not in ("auto", "median", "surface"):
         light = mean_image(frames, source, roi, "background") - counts.dark
         field = np.log(np.where(light > 0, light, np.nan))
-        return _Background(_lit(field, Light.over(border(field.shape))), f"background: {source}")
+        return _Background(_lit_by_border(field), f"background: {source}")
     fitted = fit_empty_field(sample)
     covered = float(np.mean(fitted.outside < _LEAVES))
     if source == "median" or (source == "auto" and covered <= _COVERED):
         field = median_field(sample)
-        shown = _imprint(field, fitted, sample)
+        shown = _imprint(field, fitted)
         if shown <= _COVERED:
             return _median(field, covered)
         if source == "median":
@@ -235,53 +275,88 @@ def _find_background(
     return _Background(_lit(fitted.log_light, fitted.light), note, (unsure,) * filled)
 
 
-def _median(field: Array, covered: float) -> _Background:
+def _median(field: NDArray[Any], covered: float) -> _Background:
     note = f"background: median in time; the particle leaves {1 - covered:.0%} of the frame most of the time"
-    return _Background(_lit(field, Light.over(border(field.shape))), note)
+    return _Background(_lit_by_border(field), note)
 
 
-def _imprint(field: Array, fitted: EmptyField, sample: NDArray[np.float32]) -> float:
-    """Return the share of pixels in which a field is darker than the fitted one where the particle stays."""
+def _imprint(field: NDArray[Any], fitted: EmptyField) -> float:
+    """Return the share of cells in which a field is darker than the fitted one where the particle stays."""
     stays = fitted.outside < _LEAVES
-    missing = fitted.log_light - field
+    missing = averaged(fitted.log_light - field, fitted.light.cells)
     if not stays.all():
         missing -= np.nanmedian(missing[~stays])
-    depth = np.nanquantile(fitted.log_light - sample, 0.999)
-    return float(np.mean(stays & (missing > _IMPRINT * depth)))
+    return float(np.mean(stays & (missing > _IMPRINT * fitted.depth)))
 
 
-def _lit(field: Array, light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:
+def _nothing(logs: NDArray[Any]) -> NDArray[Any]:
+    """Tell no attenuation before a background that isn't known."""
+    logs[:] = np.nan
+    return _cells(logs.shape).average(logs)
+
+
+def _lit(field: NDArray[Any], light: Light) -> Callable[[NDArray[Any]], NDArray[Any]]:
     """Return the attenuation before a background as bright as each frame."""
-    single = field.astype(np.float32)
+    unknown, pixels = np.flatnonzero(~np.isfinite(field)), Cells(field.shape)
+    if len(unknown) > field.size / 2:
+        return _nothing
+    double = np.nan_to_num(field)
+    single = double.astype(np.float32)
+
+    looked, halved = _cells(field.shape), Cells(grid(_cells(field.shape)), 2)
 
     def attenuation(logs: NDArray[Any]) -> NDArray[Any]:
-        ratio: NDArray[Any] = np.subtract(single if logs.dtype == np.float32 else field, logs, out=logs)
-        ratio -= light.of(light.fit(ratio), ratio.shape)
-        return ratio
+        np.subtract(single if logs.dtype == np.float32 else double, logs, out=logs)
+        np.put(logs, unknown, 0)
+        look = looked.average(logs)
+        told = light.fit(averaged(look, halved) if light.cells.binning > looked.binning else look)
+        light.take_off(logs, told, pixels)
+        np.put(logs, unknown, 0)
+        if looked.binning > 1:
+            light.take_off(look, told, looked)
+        return look
 
     return attenuation
 
 
-def _above_border(logs: NDArray[Any], degree: int) -> NDArray[Any]:
-    return np.asarray(_border_surface(logs, degree) - logs)
+def _lit_by_border(field: NDArray[Any]) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return the attenuation before a background as bright as each frame's border."""
+    cells = coarse(field.shape)
+    return _lit(field, Light.over(border(grid(cells)) & np.isfinite(cells.average(field)), cells))
 
 
-def _border_surface(logs: NDArray[Any], degree: int) -> Array:
-    """Fit a polynomial surface through a frame's border, the second time without outliers."""
-    image = np.exp(logs.astype(float))
-    height, width = image.shape
-    x2, x1 = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
+def _above_border(shape: tuple[int, ...], degree: int) -> Callable[[NDArray[Any]], NDArray[Any]]:
+    """Return the attenuation before a polynomial surface through each frame's border."""
+    cells, looked = coarse(shape), _cells(shape)
+    edge = border(grid(cells))
     powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-    basis = np.stack([x1**i * x2**j for i, j in powers], axis=-1)
-    edge = border((height, width))
-    values, columns = image[edge], basis[edge]
+    x2, x1 = np.meshgrid(*axes(cells), indexing="ij")
+    basis = np.stack([x1[edge] ** i * x2[edge] ** j for i, j in powers], axis=1)
+    rows, columns = (axis ** np.arange(degree + 1)[:, None] for axis in axes(Cells(shape)))
+
+    def attenuation(logs: NDArray[Any]) -> NDArray[Any]:
+        by_power: Array = np.zeros((degree + 1, degree + 1))
+        by_power[tuple(np.transpose(powers))] = _fit(basis, np.exp(averaged(logs, cells)[edge].astype(float)))
+        surface: NDArray[Any] = (by_power @ rows).T.astype(logs.dtype) @ columns.astype(logs.dtype)
+        if not surface.min() > 0:
+            surface[~(surface > 0)] = np.nan
+        np.subtract(np.log(surface, out=surface), logs, out=logs)
+        unknown = np.isnan(logs)
+        if unknown.any():
+            logs[unknown] = np.nan if share(unknown) > 0.5 else 0.0
+        return looked.average(logs)
+
+    return attenuation
+
+
+def _fit(basis: Array, values: Array) -> Array:
+    """Fit ``(P, B)`` functions to ``(P,)`` values, the second time without outliers."""
     keep = np.isfinite(values)
-    coefficients = np.zeros(len(powers))
+    coefficients = np.zeros(basis.shape[1])
     for _ in range(2):
-        if keep.sum() < len(powers):
+        if keep.sum() < basis.shape[1]:
             break
-        coefficients = np.linalg.lstsq(columns[keep], values[keep], rcond=None)[0]
-        misfit = np.abs(values - columns @ coefficients)
+        coefficients = np.asarray(np.linalg.lstsq(basis[keep], values[keep], rcond=None)[0], dtype=float)
+        misfit = np.abs(values - basis @ coefficients)
         keep &= misfit <= 3 * np.median(misfit[keep]) + 1e-12
-    surface = basis @ coefficients
-    return np.asarray(np.log(np.where(surface > 0, surface, np.nan)))
+    return coefficients

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,13 @@ from trapcli.stack.frames import Frames
 from trapcli.stack.opening import open_stack
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 _SAMPLED = 96  # frames that a background is made of
-_SAMPLED_BYTES = 128 << 20  # that they may take in single precision
-_PAIRS = 16  # of them that are looked at with the next one
+_SAMPLED_BYTES = 128 << 20  # that they may take as they are stored
+_PAIRS = 16  # frames that are looked at with the next one
 _FEWEST = 16
+_BAND_BYTES = 16 << 20  # of logarithms of all frames at a time
 
 
 @dataclass(frozen=True)
@@ -31,32 +34,22 @@ class LogLight:
     values:
         ``(H, W)``; half a step where there is no light.
     dark, bright:
-        ``(H, W)`` pixels without light, and those as bright as a pixel can be.
+        ``(H, W)`` pixels without light, and those as bright as a pixel can be; None where there are none.
     """
 
     values: NDArray[Any]
-    dark: NDArray[np.bool_]
-    bright: NDArray[np.bool_]
+    dark: Bools | None
+    bright: Bools | None
 
+    @property
+    def dark_share(self) -> float:
+        """Share of the pixels."""
+        return share(self.dark)
 
-@dataclass(frozen=True)
-class Sample:
-    """Frames spread over the stack.
-
-    Attributes
-    ----------
-    logs:
-        ``(K, H, W)`` logarithms of the light, K ≤ 112; NaN in pixels without light, and in bright ones unless
-        most frames are overexposed.
-    overexposed:
-        Share of the frames.
-    repeated:
-        Share of the frames that are the same, pixel by pixel, as the one before.
-    """
-
-    logs: NDArray[np.float32]
-    overexposed: float
-    repeated: float
+    @property
+    def bright_share(self) -> float:
+        """Share of the pixels."""
+        return share(self.bright)
 
 
 @dataclass(frozen=True)
@@ -71,7 +64,7 @@ class Counts:
         Pixel value that no light exceeds; infinite for floats.
     """
 
-    dark: float | Array
+    dark: float | NDArray[Any]
     highest: float
 
     @classmethod
@@ -90,56 +83,115 @@ class Counts:
             highest = float(np.iinfo(frames.dtype.str).max)
             if frames.info.bits:
                 highest = min(highest, float(2**frames.info.bits - 1))
-        return cls(_dark_level(frames, config, roi), highest)
+        dark = _dark_level(frames, config, roi)
+        if isinstance(dark, np.ndarray) and frames.dtype != np.float64:
+            dark = dark.astype(np.float32)
+        return cls(dark, highest)
 
-    def log_light(self, image: NDArray[Any], dtype: np.dtype[Any]) -> LogLight:
-        """Return log(image − dark)."""
-        light = np.asarray(image, dtype=dtype) - np.asarray(self.dark, dtype=dtype)
-        bright = np.asarray(image >= self.highest)
-        if light.min() > 0 and light.max() < math.inf:
-            return LogLight(np.log(light, out=light), np.zeros(light.shape, bool), bright)
-        step = 0.5 if image.dtype.kind in "iub" else _smallest(image - self.dark)
-        lit = np.isfinite(light) & (light > 0)
-        return LogLight(np.log(np.where(lit, light, dtype.type(step))), ~lit, bright)
+    def log_light(self, image: NDArray[Any], out: NDArray[Any]) -> LogLight:
+        """Write log(image − dark) to `out`, in its precision, and tell what it is worth."""
+        counted = image.dtype.kind in "iub"
+        with np.errstate(over="ignore"):  # what single precision can't hold is no light
+            if isinstance(self.dark, np.ndarray) or self.dark:
+                np.subtract(image, self.dark, out=out, dtype=out.dtype)
+            else:
+                np.copyto(out, image, casting="same_kind")
+        bright = image >= self.highest if counted and image.max() >= self.highest else None
+        dark = None
+        if not (out.min() > 0 and (counted or out.max() < math.inf)):
+            dark = np.asarray(out <= 0) if counted else ~(np.isfinite(out) & (out > 0))
+            out[dark] = 0.5 if counted else _half_the_smallest(out[~dark])
+        np.log(out, out=out)
+        return LogLight(out, dark, bright)
 
-    def sample(self, frames: Frames, most_flagged: float) -> Sample:
-        """Look at frames spread over the stack, some of them neighbours.
+    def logs(self, image: NDArray[Any], *, keep_bright: bool) -> NDArray[np.float32]:
+        """Return log(image − dark), NaN in pixels without light and, unless kept, in bright ones."""
+        light = self.log_light(image, np.empty(image.shape, np.float32))
+        for mask in (light.dark, None if keep_bright else light.bright):
+            if mask is not None:
+                light.values[mask] = np.nan
+        return light.values
+
+    def sample(self, frames: Frames, most_flagged: float, most: int = _SAMPLED) -> Sample:
+        """Look at frames spread over the stack, and whether the next ones are the same.
 
         Parameters
         ----------
         most_flagged:
             Share of pixels without light beyond which a frame is left out, and of bright ones beyond which
             it is overexposed and left out unless most frames are.
+        most:
+            Frames at most.
         """
-        count = min(_SAMPLED, max(_FEWEST, _SAMPLED_BYTES // (4 * frames.shape[1] * frames.shape[2])))
-        wanted = np.unique(np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int))
+        frame_bytes = frames.shape[1] * frames.shape[2] * frames.dtype.itemsize
+        count = min(most, max(_FEWEST, _SAMPLED_BYTES // frame_bytes), len(frames))
+        wanted = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
         followed = wanted[:: max(1, len(wanted) // _PAIRS)] + 1
-        wanted = np.union1d(wanted, followed[followed < len(frames)])
-        logs = np.empty((len(wanted), *frames.shape[1:]), np.float32)
-        bright: list[NDArray[np.bool_]] = []
+        followed = followed[followed < len(frames)]
+        images = np.empty((len(wanted), *frames.shape[1:]), frames.dtype)
+        bright: list[float] = []
         repeats: list[bool] = []
-        before, last = np.empty(0), -2
-        for position, image in zip(wanted, frames.pick(wanted), strict=True):
-            if position == last + 1:
+        before, logs = np.empty(0), np.empty(frames.shape[1:], np.float32)
+        both = np.union1d(wanted, followed)
+        for position, image in zip(both, frames.pick(both), strict=True):
+            if position in followed:
                 repeats.append(np.array_equal(image, before))
-            before, last = np.array(image), position
-            light = self.log_light(image, np.dtype(np.float32))
-            if light.dark.mean() <= most_flagged:
-                light.values[light.dark] = np.nan
-                logs[len(bright)] = light.values
-                bright.append(light.bright)
+            if position in wanted:
+                before = images[len(bright)]
+                before[:] = image
+                light = self.log_light(image, logs)
+                if light.dark_share <= most_flagged:
+                    bright.append(light.bright_share)
         if not bright:
             raise InputError(
                 f"{frames.info.source}: all frames are dark; give --attenuation if they are no raw images"
             )
-        spoilt = np.mean(bright, axis=(1, 2)) > most_flagged
+        spoilt = np.array(bright) > most_flagged
         overexposed, repeated = float(spoilt.mean()), float(np.mean(repeats or [False]))
-        logs = logs[: len(bright)]
-        if overexposed <= 0.5:
-            for image, mask in zip(logs, bright, strict=True):
-                image[mask] = np.nan
-            logs = logs[~spoilt] if spoilt.any() else logs
-        return Sample(logs, overexposed, repeated)
+        images = images[: len(bright)]
+        if overexposed <= 0.5 and spoilt.any():
+            images = images[~spoilt]
+        return Sample(self, images, overexposed, repeated)
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Frames spread over the stack.
+
+    Attributes
+    ----------
+    counts:
+        What their values mean.
+    images:
+        ``(K, H, W)`` pixel values, K ≤ 96, without dark frames, and without overexposed ones unless most are.
+    overexposed:
+        Share of the frames.
+    repeated:
+        Share of the frames that are the same, pixel by pixel, as the one before.
+    """
+
+    counts: Counts
+    images: NDArray[Any]
+    overexposed: float = 0.0
+    repeated: float = 0.0
+
+    @property
+    def keep_bright(self) -> bool:
+        """Whether most frames are overexposed, so that bright pixels tell something too."""
+        return self.overexposed > 0.5
+
+    def logs(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the ``(H, W)`` logarithms of the light; NaN in pixels that tell nothing."""
+        return (self.counts.logs(image, keep_bright=self.keep_bright) for image in self.images)
+
+    def bands(self) -> Iterator[tuple[slice, NDArray[np.float32]]]:
+        """Yield some rows and their ``(K, h, W)`` logarithms in all frames."""
+        height = max(1, _BAND_BYTES // (4 * self.images[:, 0].size))
+        for top in range(0, self.images.shape[1], height):
+            rows = slice(top, top + height)
+            dark = self.counts.dark[rows] if isinstance(self.counts.dark, np.ndarray) else self.counts.dark
+            part = replace(self, counts=replace(self.counts, dark=dark), images=self.images[:, rows])
+            yield rows, np.array(list(part.logs()))
 
 
 def mean_image(frames: Frames, path: str, roi: tuple[int, ...], name: str) -> Array:
@@ -150,11 +202,17 @@ def mean_image(frames: Frames, path: str, roi: tuple[int, ...], name: str) -> Ar
         raise InputError(f"{path}: the {name} is {size} pixels but the frames are {wanted}")
     total = np.zeros(empty.shape[1:])
     for block in empty.blocks():
-        total += block.sum(axis=0, dtype=float)
+        for image in block:
+            total += image
     return total / len(empty)
 
 
-def _dark_level(frames: Frames, config: PreprocessConfig, roi: tuple[int, ...]) -> float | Array:
+def share(mask: Bools | None) -> float:
+    """Return the share of the pixels in which a mask is true; without a mask, in none."""
+    return 0.0 if mask is None else np.count_nonzero(mask) / mask.size
+
+
+def _dark_level(frames: Frames, config: PreprocessConfig, roi: tuple[int, ...]) -> float | NDArray[Any]:
     level = config.dark_level
     if level is None:
         return mean_image(frames, config.dark, roi, "dark frame")
@@ -163,7 +221,6 @@ def _dark_level(frames: Frames, config: PreprocessConfig, roi: tuple[int, ...]) 
     return level
 
 
-def _smallest(light: NDArray[Any]) -> float:
-    """Return half the smallest light of floats."""
-    positive = light[np.isfinite(light) & (light > 0)]
-    return float(positive.min()) / 2 if positive.size else 1.0
+def _half_the_smallest(light: NDArray[Any]) -> float:
+    """Return half the smallest light of floats, and no less than has a logarithm."""
+    return max(float(light.min()) / 2, float(np.finfo(light.dtype).tiny)) if light.size else 1.0

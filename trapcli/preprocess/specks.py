@@ -35,6 +35,10 @@ _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
 _DEEPEST = 0.98
 _NEAR = 14  # half the edge of the window in which a speck is fitted [pixels]
 _TOGETHER = 10  # distance at which two specks are fitted together [pixels]
+_REACH = _NEAR + _TOGETHER  # from what is hidden, up to which specks are looked for [pixels]
+MARGIN = _REACH + _NEAR
+"""Distance from what is hidden up to which pixels tell of its specks [pixels]."""
+
 _OTHERS = 6.0  # radius in which pixels belong to another candidate [pixels]
 _MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
 _ROUNDS = 3  # of looking for more
@@ -72,6 +76,12 @@ class Standing:
         parts = [_mean(part) for part in np.array_split(frames, min(_PARTS, len(frames)))]
         return cls(_mean(frames), noise / np.sqrt(len(frames)), np.array(parts), frames, _drift(frames))
 
+    @cached_property
+    def changes(self) -> Array:
+        """Variance of what is sharp in the mean, told by how the parts differ, ``(H, W)``."""
+        sharp = np.array([_sharp(part) for part in self.parts])
+        return np.asarray(ndimage.gaussian_filter(sharp.var(axis=0, ddof=1), _SHARP[1]) / len(sharp))
+
 
 def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
     """Return the specks that are not wholly in `free`, as they are in log I₀, and their number.
@@ -84,7 +94,7 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
     shape = standing.image.shape
     if free.all():
         return np.zeros(shape), 0
-    reach = ndimage.binary_dilation(~free, iterations=_NEAR + _TOGETHER)
+    reach = ndimage.binary_dilation(~free, iterations=_REACH)
     whole = float(np.abs(standing.image).sum())
     specks: list[Array] = []
     refused = np.zeros(shape, bool)
@@ -141,9 +151,12 @@ def render(specks: list[Array], shape: tuple[int, ...]) -> Array:
 
 def _mean(stack: Stack) -> Array:
     """Return the mean in time of what is known; 0 where nothing is."""
-    known = np.isfinite(stack)
-    total = np.where(known, stack, 0).sum(axis=0, dtype=float)
-    return np.asarray(total / np.maximum(known.sum(axis=0), 1))
+    total, count = np.zeros((2, *stack.shape[1:]))
+    for image in stack:
+        known = np.isfinite(image)
+        np.add(total, image, out=total, where=known)
+        count += known
+    return np.asarray(total / np.maximum(count, 1))
 
 
 def _profile(
@@ -196,9 +209,7 @@ def _window(place: Array, shape: tuple[int, ...], reach: int) -> tuple[slice, sl
 def _candidates(standing: Standing, known: Array, reach: Bools) -> Array:
     """Return the ``(C, 2)`` places where something sharp and round stays, the clearest first."""
     sharp = _sharp(standing.image - known)
-    parts = np.array([_sharp(part) for part in standing.parts])
-    changes = ndimage.gaussian_filter(parts.var(axis=0, ddof=1), _SHARP[1]) / len(parts)
-    clear = np.abs(sharp) / np.sqrt(changes + standing.error**2 / 4 + 1e-12)
+    clear = np.abs(sharp) / np.sqrt(standing.changes + standing.error**2 / 4 + 1e-12)
     top = np.abs(sharp) >= ndimage.maximum_filter(np.abs(sharp), 3)
     top &= reach & (clear > _SEEN) & (np.abs(sharp) > _FAINTEST / 2) & _is_compact(sharp)
     places = np.argwhere(top)

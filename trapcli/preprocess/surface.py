@@ -4,29 +4,38 @@ A frame is I(t, x) = f(t) I₀(x) exp(−J(t, x)). Outside of the particle J is 
 log I₀, seen in many frames: a smooth surface is fitted to all of it and carried on under the particle. What
 is sharp in I₀ (dust, dirt) stays in place while the particle's projection moves and turns, which tells the
 two apart.
+
+Where the particle is, how bright each frame and how the light falls off, a coarse look tells as well: pixels
+are averaged to cells for that. Only what is sharp is looked for pixel by pixel.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from trapcli.preprocess.specks import Standing, find_specks
+from trapcli.motion.cells import Cells
+from trapcli.preprocess.counts import Sample
+from trapcli.preprocess.specks import MARGIN, Standing, find_specks
 
 Array = NDArray[np.float64]
 Stack = NDArray[np.float32]
+Real = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
+_COARSE = 128  # least cells across a frame, where it has as many pixels
 _BORDER = 0.04  # width of the border, as a share of the shorter edge
 _DEGREES = (2, 4, 6)  # of the surface; the one that best foretells the field beside the particle is taken
-_PATCH = 5  # edge of the mean in which the particle must stand out [pixels]
-_LOOK = 2  # first round in which specks under the particle are looked for
+_PATCH = 5  # edge of the mean in which the particle must stand out [cells]
 _DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, as a share of its peak
-_CLEAR = 0.8  # the same in standard deviations of a pixel: 4 of the mean over a patch
+_CLEAR = 0.8  # the same in standard deviations of a cell: 4 of the mean over a patch
 _ALWAYS = 0.9  # share of the frames in which dust is seen
 _SMALL = 0.1  # its area as a share of the particle's
 _MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
@@ -34,75 +43,87 @@ _DIRECT = (
     0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
 )
 _SIGNIFICANT = 4.0  # standard deviations
-_QUIET = 0.95  # share of frames in which a pixel that tells the brightness lies outside of the particle
-_LEAST_QUIET = 0.02  # share of such pixels below which the border has to do
+_QUIET = 0.95  # share of frames in which a cell that tells the brightness lies outside of the particle
+_LEAST_QUIET = 0.02  # share of such cells below which the border has to do
 _FOOTPRINT = 1e-3  # depth down to which a speck counts
 _TILTED = 0.003  # least tilt of the light, from the middle to the edge of a frame, that is taken out
-_TYPICAL_PIXELS = 4096  # that tell what misfit is common among those
-_MOST_PIXELS = 65536  # of a surface, and of a frame's brightness: enough for both
+_TYPICAL_CELLS = 2048  # that tell what misfit is common among those
+_MOST_CELLS = 16384  # that a surface is fitted to
+_DIFFERENCES = 1 << 18  # of neighbours in time that tell the noise
+_NOISE_FRAMES = 4  # that tell the noise of pixels
+_TINY = 1e-30  # variance that is none
+_SPECK_BYTES = 64 << 20  # of frames in which specks are looked for
 
 
 @dataclass(frozen=True)
 class Light:
-    """How bright each frame is, told by pixels that the particle leaves free.
+    """How bright each frame is, told by cells that the particle leaves free.
 
     Attributes
     ----------
-    pixels:
-        ``(P,)`` those pixels, as positions in the flattened frame.
+    cells:
+        How pixels are averaged.
+    places:
+        ``(P,)`` those cells, as positions in the flattened image.
     basis:
         ``(P, B)`` values there of 1, or of 1, x1 and x2.
-    surface:
-        ``(B, H·W)`` the same in all pixels.
     """
 
-    pixels: NDArray[np.intp]
+    cells: Cells
+    places: NDArray[np.intp]
     basis: Array
-    surface: Array
 
     @classmethod
-    def over(cls, free: Bools, *, tilted: bool = False) -> Light:
-        """Use the pixels of a ``(H, W)`` mask; the border where they are too few."""
+    def over(cls, free: Bools, cells: Cells, *, tilted: bool = False) -> Light:
+        """Use the cells of an ``(h, w)`` mask; the border where they are too few."""
         if free.mean() < _LEAST_QUIET:
             free = border(free.shape)
-        pixels = np.flatnonzero(free)
-        pixels = pixels[:: -(-len(pixels) // _MOST_PIXELS)]
-        x2, x1 = (axis.ravel() for axis in np.meshgrid(*map(_unit, free.shape), indexing="ij"))
-        surface = np.stack([np.ones(free.size), x1, x2][: 3 if tilted else 1])
-        return cls(pixels, surface[:, pixels].T, surface)
+        places = np.flatnonzero(free)
+        x2, x1 = (axis.ravel()[places] for axis in np.meshgrid(*axes(cells), indexing="ij"))
+        return cls(cells, places, np.stack([np.ones(len(places)), x1, x2][: 3 if tilted else 1], axis=1))
 
-    def fit(self, log_ratio: NDArray[np.floating]) -> Array:
-        """Return the ``(B,)`` coefficients of the light in ``(H, W)`` log(I / I₀); NaN where not known."""
-        values = log_ratio.ravel()[self.pixels].astype(float)
+    @property
+    def tilted(self) -> bool:
+        """Whether the light may tilt from frame to frame."""
+        return bool(self.basis.shape[1] > 1)
+
+    def fit(self, log_ratio: NDArray[Any]) -> Array:
+        """Return the ``(B,)`` coefficients of the light in ``(h, w)`` log(I / I₀); NaN where not known."""
+        values = log_ratio.ravel()[self.places].astype(float)
         keep = np.isfinite(values)
         coefficients = np.full(self.basis.shape[1], np.nan)
         if np.count_nonzero(keep) < 3 * self.basis.shape[1]:
             return coefficients
         values, basis = (values, self.basis) if keep.all() else (values[keep], self.basis[keep])
-        some = slice(None, None, max(1, len(values) // _TYPICAL_PIXELS))
-        misfit = values - np.median(values[some])
+        some = slice(None, None, max(1, len(values) // _TYPICAL_CELLS))
+        misfit = values - _median(values[some])
         for _ in range(2):
-            near = np.abs(misfit) <= 3 * 1.4826 * np.median(np.abs(misfit[some])) + 1e-12
-            if self.basis.shape[1] == 1:
-                coefficients = np.array([near.astype(float) @ values / np.count_nonzero(near)])
+            near = np.abs(misfit) <= 3 * 1.4826 * _median(np.abs(misfit[some])) + 1e-12
+            if self.tilted:
+                weighted = basis * near[:, None]
+                # the basis is close to orthogonal
+                coefficients = np.linalg.lstsq(weighted.T @ basis, weighted.T @ values, rcond=None)[0]
             else:
-                coefficients = np.linalg.lstsq(basis[near], values[near], rcond=None)[0]
-            misfit = values - (coefficients if len(coefficients) == 1 else basis @ coefficients)
+                coefficients = np.array([near.astype(float) @ values / np.count_nonzero(near)])
+            misfit = values - basis @ coefficients
         return coefficients
 
-    def of(self, coefficients: Array, shape: tuple[int, ...]) -> Array:
-        """Return the light in all pixels, or what is added to all alike."""
-        if len(coefficients) == 1:
-            return coefficients
-        return np.asarray((coefficients @ self.surface).reshape(shape))
+    def take_off(self, image: NDArray[Any], coefficients: Array, cells: Cells) -> None:
+        """Take the light off an image, in pixels or cells of any size."""
+        if not self.tilted:
+            image -= image.dtype.type(coefficients[0])
+            return
+        x2, x1 = axes(cells)
+        image -= (coefficients[0] + coefficients[1] * x1).astype(image.dtype)
+        image -= (coefficients[2] * x2[:, None]).astype(image.dtype)
 
-    def even(self, logs: Stack, field: Array) -> Stack:
-        """Return ``(K, H, W)`` log(I / I₀) without each frame's light; all NaN where nothing tells it."""
-        evened, single = np.empty_like(logs), field.astype(np.float32)
-        for image, log in zip(evened, logs, strict=True):
-            np.subtract(log, single, out=image)
-            image -= self.of(self.fit(image), image.shape).astype(np.float32)
-        return evened
+    def even(self, ratios: Stack) -> tuple[Stack, Array]:
+        """Return ``(K, h, w)`` log(I / I₀) without each frame's light, and its ``(K, B)`` coefficients."""
+        coefficients = np.array([self.fit(image) for image in ratios])
+        evened = ratios.copy()
+        for image, light in zip(evened, coefficients, strict=True):
+            self.take_off(image, light, self.cells)
+        return evened, coefficients
 
 
 @dataclass(frozen=True)
@@ -116,16 +137,24 @@ class EmptyField:
     light:
         Tells the brightness of a frame.
     outside:
-        ``(H, W)`` share of the frames in which a pixel lies outside of the particle.
+        ``(h, w)`` share of the frames in which a cell lies outside of the particle.
+    depth:
+        Of the particle.
     degree, specks:
         Of the surface; number of specks found under the particle.
     """
 
-    log_light: Array
+    log_light: NDArray[np.float32]
     light: Light
     outside: Array
+    depth: float
     degree: int
     specks: int
+
+
+def coarse(shape: tuple[int, ...]) -> Cells:
+    """Return the cells in which the light and the particle's place are looked for."""
+    return Cells(shape, max(1, 2 * (min(shape) // (2 * _COARSE))))
 
 
 def border(shape: tuple[int, ...]) -> Bools:
@@ -136,18 +165,31 @@ def border(shape: tuple[int, ...]) -> Bools:
     return mask
 
 
-def median_field(logs: Stack) -> Array:
-    """Return the median in time of ``(K, H, W)`` log I, made equally bright at the border."""
-    return _middle(Light.over(border(logs.shape[1:])).even(logs, np.zeros(logs.shape[1:])))
+def averaged(image: NDArray[Any], cells: Cells) -> NDArray[Any]:
+    """Return the means over cells of what is known; NaN where nothing is."""
+    means = cells.average(image)
+    if cells.binning == 1 or np.isfinite(means).all():
+        return means
+    known = np.isfinite(image)
+    shares = cells.average(known.astype(means.dtype))
+    sums = cells.average(np.where(known, image, 0))
+    return np.asarray(np.divide(sums, shares, out=np.full_like(means, np.nan), where=shares > 0))
 
 
-def fit_empty_field(logs: Stack) -> EmptyField:
+def median_field(sample: Sample) -> Stack:
+    """Return the ``(H, W)`` median in time of log I, made equally bright at the border."""
+    cells = coarse(sample.images.shape[1:])
+    light = Light.over(border(grid(cells)), cells)
+    levels = np.array([light.fit(averaged(image, cells))[0] for image in sample.logs()], np.float32)
+    field = np.empty(sample.images.shape[1:], np.float32)
+    for rows, logs in sample.bands():
+        logs -= levels[:, None, None]
+        field[rows] = _middle(logs)
+    return field
+
+
+def fit_empty_field(sample: Sample) -> EmptyField:
     """Find the field without the particle in frames that all show it.
-
-    Parameters
-    ----------
-    logs:
-        ``(K, H, W)`` log I of frames spread over the stack; NaN where a pixel tells nothing.
 
     Returns
     -------
@@ -155,63 +197,116 @@ def fit_empty_field(logs: Stack) -> EmptyField:
         Where the particle is never away the field is a polynomial in log I₀ plus the specks that stay in
         place; elsewhere it is measured as far as the noise allows.
     """
+    cells = coarse(sample.images.shape[1:])
+    logs = np.array([averaged(image, cells) for image in sample.logs()], np.float32)
     edge = border(logs.shape[1:])
-    light = Light.over(edge)
-    common = _middle(light.even(logs, np.zeros(logs.shape[1:])))
-    field = _surface(common, edge & np.isfinite(common), 2)
-    noise = _noise(logs, edge)
-    degree, pattern, specks = 2, np.zeros(field.shape), 0
-    outside = np.ones(logs.shape, bool)
-    for step, depth in enumerate(_DEPTHS):
-        residual = light.even(logs, field + pattern)
-        outside = _outside(residual, noise, depth)
+    light, noise = Light.over(edge, cells), _noise(logs, edge)
+    common = np.full(edge.shape, np.nan)
+    common[edge] = _middle(light.even(logs)[0][:, edge])
+    known = _fit_surface(common, np.isfinite(common), 2, cells).over(cells)
+    for depth in _DEPTHS:
+        ratios = logs - known.astype(np.float32)
+        outside = _outside(light.even(ratios)[0], noise, depth)
         quiet = outside.mean(axis=0) >= _QUIET
-        tilted = _is_tilted(logs, field + pattern, quiet, noise)
-        light = Light.over(quiet, tilted=tilted)
-        mean, count = _mean_outside(light.even(logs, field + pattern), outside)
-        mean += field + pattern
-        degree = _degree(mean, count)
-        field = _surface(mean, count, degree)
-        pattern, specks = _pattern(
-            light.even(logs, field),
-            mean - field,
-            count,
-            noise,
-            look=step >= _LOOK,
-        )
-    return EmptyField(field + pattern, light, outside.mean(axis=0), degree, specks)
+        light = Light.over(quiet, cells, tilted=_is_tilted(ratios, quiet, noise, cells))
+        evened, levels = light.even(ratios)
+        direct, count = _mean_outside(evened, outside, known.shape)
+        mean = known + direct
+        degree = _degree(mean, count, cells)
+        surface = _fit_surface(mean, count, degree, cells)
+        field = surface.over(cells)
+        known = field + _measured(mean - field, count, len(logs), noise)[0]
+    told = [image[np.isfinite(image)] for image in evened if np.isfinite(image).any()]
+    residuals = _Residuals(sample, surface.over(Cells(cells.shape)).astype(np.float32), light, levels)
+    pattern, specks = _pattern(residuals, outside)
+    return EmptyField(
+        log_light=residuals.field + pattern,
+        light=light,
+        outside=outside.mean(axis=0),
+        depth=float(np.median([np.quantile(-values, 0.999) for values in told])),
+        degree=degree,
+        specks=specks,
+    )
 
 
-def _unit(size: int) -> Array:
-    return np.linspace(-1.0, 1.0, size)
+@dataclass(frozen=True)
+class _Surface:
+    """A polynomial in both directions, as Chebyshev coefficients."""
+
+    coefficients: Array
+
+    def over(self, cells: Cells) -> Array:
+        """Return the values in the middle of all cells."""
+        rows, columns = (chebyshev.chebvander(x, len(self.coefficients) - 1) for x in axes(cells))
+        return np.asarray(rows @ self.coefficients @ columns.T)
 
 
-def _middle(stack: NDArray[np.floating]) -> Array:
-    """Return the median in time of each pixel that tells anything, row by row to save memory."""
-    middle = np.full(stack.shape[1:], np.nan)
-    for row in range(stack.shape[1]):
-        values = stack[:, row].astype(np.float32)
-        told = np.isfinite(values)
-        if told.all():
-            middle[row] = np.median(values, axis=0)
-        else:
-            some = told.any(axis=0)
-            middle[row, some] = np.nanmedian(values[:, some], axis=0)
+@dataclass(frozen=True)
+class _Residuals:
+    """What the frames of a sample show beyond a smooth field, pixel by pixel."""
+
+    sample: Sample
+    field: Stack
+    light: Light
+    levels: Array
+
+    def __iter__(self) -> Iterator[Stack]:
+        pixels = Cells(self.field.shape)
+        for logs, level in zip(self.sample.logs(), self.levels, strict=True):
+            logs -= self.field
+            self.light.take_off(logs, level, pixels)
+            yield logs
+
+
+def grid(cells: Cells) -> tuple[int, ...]:
+    """Return how many rows and columns of cells there are."""
+    return tuple(size // cells.binning for size in cells.shape)
+
+
+def axes(cells: Cells) -> list[Array]:
+    """Return where the rows and the columns of cells lie, -1 … 1 from edge to edge of the frame."""
+    b = cells.binning
+    return [2 * (b * np.arange(size // b) + (b - 1) / 2) / max(size - 1, 1) - 1.0 for size in cells.shape]
+
+
+def _in_pixels(values: NDArray[Any], cells: Cells) -> NDArray[Any]:
+    """Return values of cells in all pixels; those that no cell holds are like their neighbours."""
+    b = cells.binning
+    rows, columns = (np.minimum(np.arange(size) // b, size // b - 1) for size in cells.shape)
+    return np.asarray(values[:, columns][rows])
+
+
+def _median(values: Array) -> float:
+    """Return the upper median, without what makes `numpy.median` slow on few values."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def _middle(stack: Stack) -> Array:
+    """Return the median in time of each pixel that tells anything."""
+    values: NDArray[Any] = np.ascontiguousarray(np.moveaxis(stack, 0, -1))
+    told = np.isfinite(values)
+    if told.all():
+        return np.asarray(np.median(values, axis=-1, overwrite_input=True))
+    some = told.any(axis=-1)
+    middle = np.full(some.shape, np.nan)
+    middle[some] = np.nanmedian(np.where(told, values, np.nan)[some], axis=-1)
     return middle
 
 
 def _noise(logs: Stack, edge: Bools) -> float:
-    """Return the standard deviation of a pixel, from differences of neighbours at the border."""
+    """Return the standard deviation of the noise, from how neighbours at the border change in time.
+
+    Neither a field that stays nor a smooth light that varies counts.
+    """
     both = edge[:, 1:] & edge[:, :-1]
-    differences = np.diff(logs, axis=2)[:, both]
-    differences = differences[np.isfinite(differences)]
-    if not len(differences):
-        return 0.0
-    return float(1.4826 * np.median(np.abs(differences - np.median(differences))) / np.sqrt(2))
+    some = logs[: max(2, _DIFFERENCES // max(1, int(both.sum())))]
+    changes = np.diff(np.diff(some, axis=0), axis=2)[:, both]
+    changes = changes[np.isfinite(changes)]
+    return float(1.4826 * np.median(np.abs(changes)) / 2) if len(changes) else 0.0
 
 
 def _outside(residual: Stack, noise: float, depth: float) -> Bools:
-    """Tell which pixels of each frame the particle leaves free, with a margin around it."""
+    """Tell which cells of each frame the particle leaves free, with a margin around it."""
     smooth = np.empty_like(residual)
     for image, raw in zip(smooth, residual, strict=True):
         ndimage.uniform_filter(np.nan_to_num(raw), _PATCH, output=image)
@@ -234,39 +329,52 @@ def _stuck(inside: Bools) -> Bools:
     return np.asarray(small[labels])
 
 
-def _mean_outside(residual: Stack, outside: Bools) -> tuple[Array, Array]:
-    """Return the mean over the frames in which a pixel is free, and their number."""
-    count = outside.sum(axis=0, dtype=float)
-    total = np.zeros(count.shape)
+def _mean_outside(
+    residual: Iterable[Stack], outside: Iterable[Bools], shape: tuple[int, ...]
+) -> tuple[Stack, Stack]:
+    """Return the mean over the frames in which a pixel is free and known, and their number."""
+    total, count, weighted = np.zeros((3, *shape), np.float32)
     for image, free in zip(residual, outside, strict=True):
-        np.add(total, image, out=total, where=free)
-    return total / np.maximum(count, 1), count
+        if np.isfinite(image).all():
+            np.multiply(image, free, out=weighted)
+            total += weighted
+            count += free
+        else:
+            told = free & np.isfinite(image)
+            total += np.where(told, image, 0)
+            count += told
+    total /= np.maximum(count, 1)
+    return total, count
 
 
-def _surface(values: Array, weights: NDArray[np.generic], degree: int) -> Array:
-    """Fit a polynomial surface to ``(H, W)`` values, without what does not belong to it."""
-    stride = max(1, round(np.sqrt(values.size / _MOST_PIXELS)))
-    axes = [chebyshev.chebvander(_unit(size), degree) for size in values.shape]
+def _fit_surface(values: Array, weights: NDArray[np.generic], degree: int, cells: Cells) -> _Surface:
+    """Fit a polynomial surface to ``(h, w)`` values, without what does not belong to it."""
+    stride = max(1, round(np.sqrt(values.size / _MOST_CELLS)))
+    rising = [chebyshev.chebvander(axis, degree) for axis in axes(cells)]
     orders = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    square = np.zeros((degree + 1, degree + 1))
     rows, columns = np.nonzero(np.asarray(weights, dtype=float)[::stride, ::stride] > 0)
     if len(rows) < 3 * len(orders):
-        return np.full(values.shape, float(np.nanmedian(values)))
+        square[0, 0] = float(np.nanmedian(values))
+        return _Surface(square)
     rows, columns = rows * stride, columns * stride
-    basis = np.stack([axes[0][rows, i] * axes[1][columns, j] for i, j in orders], axis=1)
-    told, root = values[rows, columns], np.sqrt(np.asarray(weights, dtype=float)[rows, columns])
+    root = np.sqrt(np.asarray(weights, dtype=float)[rows, columns])
+    basis = np.stack([rising[0][rows, i] * rising[1][columns, j] for i, j in orders], axis=1)
+    directions, triangle = np.linalg.qr(basis * root[:, None])
+    told = values[rows, columns] * root
     robust = np.ones(len(told))
     for _ in range(6):
-        scale = root * robust
-        coefficients = np.linalg.lstsq(basis * scale[:, None], told * scale, rcond=None)[0]
-        misfit = (told - basis @ coefficients) * root
+        weighted = directions * (robust**2)[:, None]
+        # of orthogonal columns the normal equations lose nothing
+        found = np.linalg.lstsq(weighted.T @ directions, weighted.T @ told, rcond=None)[0]
+        misfit = told - directions @ found
         limit = 4.685 * 1.4826 * np.median(np.abs(misfit)) + 1e-12
         robust = np.clip(1 - (misfit / limit) ** 2, 0, None)
-    square = np.zeros((degree + 1, degree + 1))
-    square[tuple(np.transpose(orders))] = coefficients
-    return np.asarray(axes[0] @ square @ axes[1].T)
+    square[tuple(np.transpose(orders))] = np.linalg.lstsq(triangle, found, rcond=None)[0]
+    return _Surface(square)
 
 
-def _degree(mean: Array, count: Array) -> int:
+def _degree(mean: Array, count: Real, cells: Cells) -> int:
     """Return the degree whose fit to the field away from the particle best foretells the field beside it."""
     free = count >= _DIRECT * count.max()
     if free.all():
@@ -275,34 +383,73 @@ def _degree(mean: Array, count: Array) -> int:
     beside = free & (distance <= np.quantile(distance[free], 0.25))
     errors = []
     for degree in _DEGREES:
-        misfit = np.abs(mean - _surface(mean, np.where(free & ~beside, count, 0), degree))[beside]
+        surface = _fit_surface(mean, np.where(free & ~beside, count, 0), degree, cells).over(cells)
+        misfit = np.abs(mean - surface)[beside]
         errors.append(float(np.sqrt(np.mean(np.minimum(misfit, 3 * np.median(misfit)) ** 2))))
     return _DEGREES[int(np.argmin(errors))]
 
 
-def _pattern(residual: Stack, direct: Array, count: Array, noise: float, look: bool) -> tuple[Array, int]:
-    """Return what the surface lacks: what is measured outside of the particle, and specks under it."""
-    measured = count >= _DIRECT * len(residual)
+def _measured(direct: Real, count: Real, frames: int, noise: float) -> tuple[Real, Bools]:
+    """Return what the surface lacks where that is measured outside of the particle, and where it is."""
+    measured = np.asarray(count >= _DIRECT * frames)
     scatter = noise / np.sqrt(np.maximum(count, 1))
     clear = measured & (np.abs(direct) > _SIGNIFICANT * scatter)
-    excess = np.median(np.abs(direct[measured & ~clear])) if (measured & ~clear).any() else 0.0
-    spread = max(
-        (1.4826 * excess) ** 2 - float(np.median(scatter[measured]) if measured.any() else 0) ** 2, 0
-    )
-    trust = np.where(clear, 1.0, spread / np.maximum(spread + scatter**2, 1e-300))
-    pattern = np.where(measured, trust * direct, 0.0)
-    if not look:
+    faint = measured & ~clear
+    excess = 1.4826 * float(np.median(np.abs(direct[faint]))) if faint.any() else 0.0
+    usual = float(np.median(scatter[measured])) if measured.any() else 0.0
+    spread = max(excess**2 - usual**2, 0.0)
+    trust = np.where(clear, 1, spread / np.maximum(spread + scatter**2, _TINY))
+    return np.where(measured, trust * direct, 0), measured
+
+
+def _pattern(residuals: _Residuals, outside: Bools) -> tuple[Stack, int]:
+    """Return what the surface lacks in pixels: what is measured beside the particle, and specks under it."""
+    cells, count_of_frames = residuals.light.cells, len(outside)
+    free = (_in_pixels(image, cells) for image in outside)
+    hidden = _in_pixels(outside.mean(axis=0) < _DIRECT, cells)
+    rows, columns = _around(hidden)
+    height, width = hidden[rows, columns].shape
+    step = max(1, -(-4 * count_of_frames * height * width // _SPECK_BYTES))
+    kept = np.empty((-(-count_of_frames // step), height, width), np.float32)
+
+    def keeping() -> Iterator[Stack]:
+        for n, image in enumerate(residuals):
+            if n % step == 0:
+                kept[n // step] = image[rows, columns]
+            yield image
+
+    direct, count = _mean_outside(keeping(), free, hidden.shape)
+    noise = _noise_of_pixels(residuals)
+    pattern, measured = _measured(direct, count, count_of_frames, noise)
+    if not hidden.any():
         return pattern, 0
-    specks, number = find_specks(Standing.of(residual, noise), measured)
+    specks, number = find_specks(Standing.of(kept, noise), measured[rows, columns])
     # a pixel that looks free when the particle happens to make up for a speck deceives
-    fitted = (np.abs(specks) > _FOOTPRINT) & (count < _QUIET * len(residual))
-    return np.where(measured & ~fitted, pattern, specks), number
+    fitted = (np.abs(specks) > _FOOTPRINT) & (count[rows, columns] < _QUIET * count_of_frames)
+    inside = pattern[rows, columns]
+    pattern[rows, columns] = np.where(measured[rows, columns] & ~fitted, inside, specks)
+    return pattern, number
 
 
-def _is_tilted(logs: Stack, field: Array, quiet: Bools, noise: float) -> bool:
+def _around(hidden: Bools) -> tuple[slice, slice]:
+    """Return the rows and columns of what is hidden, and what is needed around it."""
+    spans = []
+    for axis in (1, 0):
+        found = np.flatnonzero(hidden.any(axis=axis))
+        first, last = (int(found[0]), int(found[-1])) if len(found) else (0, -1)
+        spans.append(slice(max(0, first - MARGIN), last + 1 + MARGIN))
+    return spans[0], spans[1]
+
+
+def _noise_of_pixels(residuals: _Residuals) -> float:
+    some = np.array(list(islice(residuals, _NOISE_FRAMES)))
+    return _noise(some, border(some.shape[1:]))
+
+
+def _is_tilted(ratios: Stack, quiet: Bools, noise: float, cells: Cells) -> bool:
     """Tell whether the light tilts from frame to frame, by more than the noise makes of a steady one."""
-    light = Light.over(quiet, tilted=True)
-    tilts = np.array([light.fit(image - field)[1:] for image in logs])
+    light = Light.over(quiet, cells, tilted=True)
+    tilts = np.array([light.fit(image)[1:] for image in ratios[:: len(ratios) // 32 or 1]])
     tilts = tilts[np.isfinite(tilts).all(axis=1)]
     if len(tilts) < 8:
         return False
