@@ -148,7 +148,7 @@ def _axis_of_revolution(model: ObjectModel, R: Array, axes: Array) -> Array | No
 def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTurn | None:
     """Try turns in proportion to the fitted one, where it is about an axis in the image plane."""
     gamma = fit.path.R[:, :, 2]
-    _, _, (first, _, axis) = np.linalg.svd(gamma)
+    _, _, (first, _, axis) = np.linalg.svd(gamma, full_matrices=False)
     if np.abs(gamma @ axis).max() > _PLANAR:
         return None
     order = np.argsort(fit.path.time, kind="stable")

@@ -101,13 +101,20 @@ class Eliminated:
     carry: Array
 
 
+def local_support(values: Array) -> tuple[Indices, Array]:
+    """Return ``(N, 4)`` places and values of the basis functions that are not 0, of ``(N, size)`` values.
+
+    At most four of a cubic spline, consecutive ones, are not 0 at a time.
+    """
+    first = np.minimum(np.argmax(values != 0, axis=1), values.shape[1] - _SUPPORT)
+    places = first[:, None] + np.arange(_SUPPORT)
+    return places, np.take_along_axis(values, places, axis=1)
+
+
 def bent_blocks(values: Array, s: Indices, t: Indices, blocks: Array) -> Array:
     """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(3 · size, 3 · size)``, for ``(P, 3, 3)`` blocks."""
     size = values.shape[1]
-    # at most four of the basis functions, consecutive ones, are not 0 at a time
-    first = np.minimum(np.argmax(values != 0, axis=1), size - _SUPPORT)
-    places = first[:, None] + np.arange(_SUPPORT)
-    local = np.take_along_axis(values, places, axis=1)
+    places, local = local_support(values)
     rows = 3 * places[s][:, :, None] + np.arange(3)
     columns = 3 * places[t][:, :, None] + np.arange(3)
     flat = rows[:, :, :, None, None] * (3 * size) + columns[:, None, None]

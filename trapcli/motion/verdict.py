@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from trapcli.motion.ambiguity import UnseenTurn
 from trapcli.motion.centers import Centers
+from trapcli.motion.elimination import local_support
 from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
@@ -271,9 +272,12 @@ def _rotation_covariance(R: Array, values: Array, covariance: Array) -> Array:
     """Return ``(N, 3, 3)`` covariances of R as rotation vectors in the lab, R = 1 at the first frame."""
     # the first frame's error turns all others: ε(t) − R(t)ᵀ R(0) ε(0)
     back = np.swapaxes(R, 1, 2) @ R[0]
-    own = np.einsum("nb,bicj,nc->nij", values, covariance, values, optimize=True)
-    mixed = np.einsum("nb,bicj,c->nij", values, covariance, values[0], optimize=True)
-    start = np.einsum("b,bicj,c->ij", values[0], covariance, values[0], optimize=True)
+    places, local = local_support(values)
+    blocks = covariance[places[:, :, None], :, places[:, None, :], :]
+    own = np.einsum("nb,nbcij,nc->nij", local, blocks, local, optimize=True)
+    first = np.einsum("bicj,c->bij", covariance[:, :, places[0]], local[0])
+    mixed = np.einsum("nb,nbij->nij", local, first[places])
+    start = mixed[0]
     turned = mixed @ np.swapaxes(back, 1, 2)
     return np.asarray(own - turned - np.swapaxes(turned, 1, 2) + back @ start @ np.swapaxes(back, 1, 2))
 
@@ -283,5 +287,8 @@ def _omega_covariance(omega: Array, values: Array, slopes: Array, covariance: Ar
     x, y, z = omega.T
     zero = np.zeros_like(x)
     cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
-    design = np.einsum("nb,ij->nibj", slopes, np.eye(3)) + np.einsum("ijn,nb->nibj", cross, values)
-    return np.asarray(np.einsum("nibj,bjck,nlck->nil", design, covariance, design, optimize=True))
+    places, local = local_support(values)
+    design = np.einsum("nb,ij->nibj", np.take_along_axis(slopes, places, axis=1), np.eye(3))
+    design += np.einsum("ijn,nb->nibj", cross, local)
+    blocks = covariance[places[:, :, None], :, places[:, None, :], :]
+    return np.asarray(np.einsum("nibj,nbcjk,nlck->nil", design, blocks, design, optimize=True))
