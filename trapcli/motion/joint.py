@@ -53,6 +53,7 @@ _RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refine
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
+_MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
 _MOST_REFINED = 4  # hypotheses that are refined at most
@@ -219,7 +220,7 @@ def _refine(
     time = stack.low.time
     turned = float(np.linalg.norm(hypothesis.path.mean_omega(), axis=1).mean() * np.ptp(low.time))
     rough, fine = (
-        Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3))
+        Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3, _MOST_KNOTS))
         for least, angle in zip(_FEWEST_KNOTS, (_COARSE_KNOTS, _FINE_KNOTS), strict=True)
     )
     if knots:
