@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import trapcli
 from trapcli import pipeline
+from trapcli.motion import joint
+from trapcli.preprocess import standing
 from trapcli.preprocess.standing import find_standing_pattern, without
 from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
@@ -40,6 +42,11 @@ def specks(highest: float) -> np.ndarray:
 def test_where_nothing_stays_nothing_is_found(turning: tuple[np.ndarray, Motion]) -> None:
     frames, truth = turning
     assert find_standing_pattern(Frames.from_array(frames), truth, PIXEL) is None
+
+
+def test_dust_is_found_up_to_the_frequencies_that_judge_the_motion() -> None:
+    # what stays at higher ones would bend the motion
+    assert standing._BAND == joint._FINE_BAND
 
 
 def test_nothing_is_found_where_the_motion_is_not_known(turning: tuple[np.ndarray, Motion]) -> None:

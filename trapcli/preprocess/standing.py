@@ -34,9 +34,9 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _LINE_BAND = 1.0  # band times radius of the reduced map, of which nothing is used
-_BAND = 16.0  # band times radius: that of the object model which judges the motion
-_SPACING = 0.7  # of the points and of the object's lattice, in units of π / band
-_REACH = 1.1  # of both, in radii of the object
+_BAND = 22.0  # band times radius: that of the object model which judges the motion
+_SPACING = 0.7  # of the points, in units of π / band
+_REACH = 1.1  # of the points, in radii of the object
 _GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
 _FEWEST_GROUPS = 30
 _KNOTS = np.deg2rad(6.0)  # rotation per interval of the spline that bends the motion
@@ -248,17 +248,16 @@ class _Told:
 
 def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
     """Eliminate the object."""
-    low, band = views.low, _BAND / views.low.radius
-    k, spacing = low.k, _SPACING * np.pi / band
+    low, k = views.low, views.low.k
     weight = conjugate_share(k) / low.variance
-    half = int(_REACH * low.radius / spacing)
-    axis = np.arange(-half, half + 1)
-    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-    inside = np.linalg.norm(cube, axis=-1) * spacing <= _REACH * low.radius
+    lattice = ObjectModel(low, _BAND / low.radius)
+    spacing = lattice.spacing
+    index = np.rint(lattice.position / spacing).astype(int)
+    half = int(index.max())
     edge = 4 * half + 1
-    flat = cube[inside] @ np.array([edge**2, edge, 1])
+    flat = index @ np.array([edge**2, edge, 1])
     # amplitudes of unit variance give the power that is seen
-    scale = np.sqrt(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)) / np.count_nonzero(inside))
+    scale = np.sqrt(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)) / len(index))
     density = np.tile(weight * scale**2, len(R)).astype(complex)
     kernel = back_project(slice_points(R, k, spacing), density, edge).ravel()
     normal = kernel[flat[:, None] - flat + kernel.size // 2]
@@ -268,7 +267,7 @@ def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
     def gathered(modes: ComplexArray, k: Array) -> Array:
         """Return the products of all the object's waves with ``(G, K)`` modes."""
         everywhere = back_project(slice_points(R, k, spacing), scale * modes.ravel(), 2 * half + 1)
-        return np.asarray(everywhere[inside], float)
+        return np.asarray(everywhere[tuple((index + half).T)], float)
 
     own = np.concatenate([points.waves.real, points.waves.imag])
     one = [gathered(weight[j] * views.phase[:, j], k[j : j + 1]) for j in range(len(k))]
