@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from trapcli.motion.centers import estimate_centers, object_radius, pixel_noise
+from trapcli.motion.centers import estimate_centers, noise_between, object_radius, pixel_noise
 from trapcli.motion.translation import translation
 from trapcli.simulation.motions import PaperMotion
 from trapcli.simulation.phantoms import PaperPhantom
@@ -106,6 +108,41 @@ def test_noise_and_radius_of_a_ball() -> None:
     images = ball + 0.05 * rng.standard_normal((8, 128, 128))
     assert pixel_noise(images) == pytest.approx(0.05, rel=0.1)
     assert object_radius(images, 0.05) == pytest.approx(25, abs=2.1)
+
+
+def turning_grain(count: int, noise: float) -> np.ndarray:
+    """An ellipsoid, whose edges are sharp, which turns by 0.3 degrees from frame to frame."""
+    rows, columns = np.mgrid[:128, :128] - 64
+    angle = np.deg2rad(0.3) * np.arange(count)[:, None, None]
+    along, across = (
+        np.cos(angle) * columns + np.sin(angle) * rows,
+        np.cos(angle) * rows - np.sin(angle) * columns,
+    )
+    grain = np.sqrt(np.maximum(1 - (along / 35.3) ** 2 - (across / 12.7) ** 2, 0))
+    return grain + noise * np.random.default_rng(4).standard_normal(grain.shape)
+
+
+def noise_of_pairs(images: np.ndarray) -> float:
+    return float(np.median([noise_between(*pair) for pair in pairwise(images)]))
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.2])
+def test_sharp_edges_are_no_noise(noise: float) -> None:
+    images = turning_grain(16, noise)
+    assert noise_of_pairs(images) == pytest.approx(noise, rel=0.1)
+    if noise == 0.005:
+        assert pixel_noise(images) > 1.2 * noise
+
+
+@pytest.mark.parametrize("how", ["repeated", "interpolated"])
+def test_noise_that_goes_on_into_the_next_frame_is_told_by_each(how: str) -> None:
+    images = turning_grain(17, 0.2)
+    if how == "repeated":
+        images = images[::2].repeat(2, axis=0)
+    else:
+        images[1:-1:2] = (images[:-2:2] + images[2::2]) / 2
+    whole = np.median([noise_between(*pair) for pair in zip(images[::2], images[1::2], strict=False)])
+    assert whole == pytest.approx(0.2, rel=0.1)
 
 
 def test_faint_rings_about_an_object_are_not_part_of_it() -> None:

@@ -49,6 +49,9 @@ _FEWEST_BLOCKS = 4  # along an edge of the frame
 _EVEN = (0.2, 0.35), (0.35, 0.5)  # bands that a codec leaves as they are, in units of the highest frequency
 _ALIKE = 1.3  # ratio of the noise's power in the two
 _CUT = 1.5  # power in them, in units of that in the corners, that shows a codec at work
+_RIM = 16  # part of the shorter edge that a frame's rim is wide
+_LEAST_RIM = 8  # its width at least [pixels]
+_INDEPENDENT = 0.85  # noise of the change at the rim, in units of that of independent frames
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,33 @@ def pixel_noise(images: NDArray[Any]) -> float:
     """
     if not len(images) or min(images.shape[1:]) < 4:
         return 0.0
+    return max(_corner_noise(images), _uncut_noise(images))
+
+
+def noise_between(image: NDArray[Any], following: NDArray[Any]) -> float:
+    """Return the standard deviation of white noise in an ``(H, W)`` image, told by the next one.
+
+    Sharp edges reach the corners of the Fourier transform. They hardly move from one frame to the next, so
+    what changes is the noise, unless that itself is repeated or interpolated in time: then each image is
+    judged alone.
+    """
+    if min(image.shape) < 2 * _LEAST_RIM or not np.isfinite(following).all():
+        return pixel_noise(image[None])
+    change = (following - image) / np.sqrt(2).astype(image.dtype)
+    if not _rim_noise(change) > _INDEPENDENT * _rim_noise(image):
+        return pixel_noise(image[None])
+    return max(_corner_noise(change[None]), _uncut_noise(image[None]))
+
+
+def _rim_noise(image: NDArray[Any]) -> float:
+    """Return the median of what is left at the rim of anything smooth."""
+    width = max(_LEAST_RIM, min(image.shape) // _RIM)
+    sides = image[:width], image[-width:], image[:, :width], image[:, -width:]
+    sharp = [np.abs(np.diff(np.diff(side, 2, axis=0), 2, axis=1)).ravel() for side in sides]
+    return float(np.median(np.concatenate(sharp)))
+
+
+def _corner_noise(images: NDArray[Any]) -> float:
     k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
     k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
     corner = np.minimum(k1, k2) > 0.7
@@ -199,7 +229,7 @@ def pixel_noise(images: NDArray[Any]) -> float:
         np.median(np.abs(rfft2(image * window)[corner]) ** 2) / np.log(2) / np.sum(window**2)
         for image in images
     ]
-    return max(float(np.sqrt(np.median(powers))), _uncut_noise(images))
+    return float(np.sqrt(np.median(powers)))
 
 
 def _uncut_noise(images: NDArray[Any]) -> float:

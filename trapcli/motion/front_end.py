@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.motion.cells import Cells, cut_square
-from trapcli.motion.centers import Centers, Progress, Tracker, object_radius, pixel_noise, spread
+from trapcli.motion.centers import (
+    Centers,
+    Progress,
+    Tracker,
+    noise_between,
+    object_radius,
+    pixel_noise,
+    spread,
+)
 from trapcli.motion.low_band import LowBand, LowBandReader
 from trapcli.motion.reduced_map import BandReader
 from trapcli.motion.types import ReducedMap
@@ -129,18 +137,24 @@ def _look(attenuation: Frames) -> _Look:
     noises: list[float] = []
     coarse: list[Array] = []
     wanted = spread(len(attenuation), _SURVEY)
-    measured = set(wanted[spread(len(wanted), few)])
-    for position, image in zip(wanted, attenuation.pick(wanted), strict=True):
+    pairs = wanted[spread(len(wanted), few)]
+    both = np.union1d(wanted, np.minimum(pairs + 1, len(attenuation) - 1))
+    first, last = np.empty(0), -2
+    for position, image in zip(both, attenuation.pick(both), strict=True):
         averaged = cells.average(image)
-        if np.isfinite(averaged).all():
+        if not np.isfinite(averaged).all():
+            continue
+        if position == last + 1:
+            noises.append(noise_between(first, image))
+        if position in pairs or not len(first):
+            first, last = np.array(image), position
+        if position in wanted:
             coarse.append(np.array(averaged, float))
-            if position in measured or not noises:
-                noises.append(pixel_noise(image[None]))
     if not coarse:
         farthest = float(np.hypot(*shape))
         return _Look(0.0, 0.0, farthest, farthest)
     images = np.array(coarse)
-    noise, b = float(np.median(noises)), cells.binning
+    noise, b = float(np.median(noises or [pixel_noise(first[None])])), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
     reach = b * object_radius(images, noise / b)
     faintest = _LEAST_VISIBLE * peak
