@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from trapcli.motion.centers import (
 )
 from trapcli.motion.low_band import LowBand, LowBandReader
 from trapcli.motion.reduced_map import BandReader
+from trapcli.motion.threads import in_parallel
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.ahead import read_ahead
 from trapcli.stack.frames import Frames
@@ -156,9 +158,9 @@ def _look(attenuation: Frames) -> _Look:
     images = np.array(coarse)
     noise, b = float(np.median(noises or [pixel_noise(first[None])])), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
-    reach = b * object_radius(images, noise / b)
     faintest = _LEAST_VISIBLE * peak
-    radius = b * object_radius(images, max(noise, faintest) / b, faintest)
+    noises_of_cells, faint = (noise / b, max(noise, faintest) / b), (0.0, faintest)
+    reach, radius = (b * r for r in in_parallel(partial(object_radius, images), noises_of_cells, faint))
     return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, min(radius, reach))
 
 

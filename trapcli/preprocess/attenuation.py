@@ -219,10 +219,10 @@ def _with_particle(found: _Background, frames: Frames, sample: Sample) -> _Backg
     some = replace(sample, images=sample.images[:: len(sample.images) // _LOOKS or 1])
     looks = []
     for logs in some.logs():
-        unknown = np.isnan(logs)
-        found.attenuation(logs)
-        if np.isfinite(logs).mean() > 0.5:
-            looks.append(_known(logs, unknown, cells))
+        look = found.attenuation(logs)
+        unknown = None if np.isfinite(look).all() else np.isnan(logs)
+        if share(unknown) < 0.5:
+            looks.append(look if unknown is None else _known(logs, unknown, cells))
     particle = Particle.of(looks)
     if particle is None:
         return found
