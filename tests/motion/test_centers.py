@@ -145,17 +145,6 @@ def test_noise_that_goes_on_into_the_next_frame_is_told_by_each(how: str) -> Non
     assert whole == pytest.approx(0.2, rel=0.1)
 
 
-def test_faint_rings_about_an_object_are_not_part_of_it() -> None:
-    rng = np.random.default_rng(2)
-    rows, columns = np.mgrid[:160, :160] - 80
-    distance = np.hypot(rows, columns)
-    ball = np.sqrt(np.maximum(25**2 - distance**2, 0)) / 25
-    rings = np.where((distance > 25) & (distance < 60), 0.004 * np.cos(distance), 0.0)
-    images = ball + rings + 0.001 * rng.standard_normal((8, 160, 160))
-    assert object_radius(images, 0.001) > 50
-    assert object_radius(images, 0.001, 0.005) == pytest.approx(25, abs=2.1)
-
-
 def test_progress_is_told(paper_frames) -> None:  # type: ignore[no-untyped-def]
     told: list[tuple[str, int, int]] = []
     frames = Frames.from_array(paper_frames[0])

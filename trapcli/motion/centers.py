@@ -258,7 +258,7 @@ def _uncut_noise(images: NDArray[Any]) -> float:
     return float(np.sqrt(np.median(powers)))
 
 
-def object_radius(images: NDArray[Any], noise: float, faintest: float = 0.0) -> float:
+def object_radius(images: NDArray[Any], noise: float) -> float:
     """Return the distance from the centre up to which the object stands out of the noise [pixels].
 
     Parameters
@@ -267,14 +267,12 @@ def object_radius(images: NDArray[Any], noise: float, faintest: float = 0.0) -> 
         ``(K, H, W)`` attenuation.
     noise:
         Standard deviation of the noise of one pixel.
-    faintest:
-        Root mean square, over a ring about the centre, below which nothing counts as object.
     """
     # a coarse look will do: pixels are averaged down to some 256 across
     b = max(1, int(min(images.shape[1:])) // _COARSE)
     if b > 1:
         cells = Cells(images.shape[1:], b)
-        return b * object_radius(np.array([cells.average(image) for image in images]), noise / b, faintest)
+        return b * object_radius(np.array([cells.average(image) for image in images]), noise / b)
     radius = farthest = float(np.hypot(*images.shape[1:]))
     found: list[_Found | None] = [None] * len(images)
     for _ in range(3):
@@ -288,7 +286,6 @@ def object_radius(images: NDArray[Any], noise: float, faintest: float = 0.0) -> 
         if not len(pixels):
             return farthest
         least = np.maximum(_VISIBLE, _SIGNIFICANT * np.sqrt(2 / pixels)) * noise**2
-        least = np.maximum(least, faintest**2)
         # a noise that is a few percent off must not pass for an object as wide as the frame
         least += np.clip(np.median(power / pixels), 0, _PLATEAU * noise**2)
         seen = np.flatnonzero(power > least * pixels)

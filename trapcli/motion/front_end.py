@@ -158,9 +158,8 @@ def _look(attenuation: Frames) -> _Look:
     images = np.array(coarse)
     noise, b = float(np.median(noises or [pixel_noise(first[None])])), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
-    faintest = _LEAST_VISIBLE * peak
-    noises_of_cells, faint = (noise / b, max(noise, faintest) / b), (0.0, faintest)
-    reach, radius = (b * r for r in in_parallel(partial(object_radius, images), noises_of_cells, faint))
+    noises_of_cells = noise / b, max(noise, _LEAST_VISIBLE * peak) / b
+    reach, radius = (b * r for r in in_parallel(partial(object_radius, images), noises_of_cells))
     return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, min(radius, reach))
 
 
