@@ -42,6 +42,7 @@ MARGIN = _REACH + _NEAR
 _OTHERS = 6.0  # radius in which pixels belong to another candidate [pixels]
 _MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
 _ROUNDS = 3  # of looking for more
+_NOTHING = 1e-30  # square of a spot that isn't there
 _MOST_AT_ONCE = 60  # candidates of a round
 _MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
 
@@ -56,8 +57,6 @@ class Standing:
         ``(H, W)`` mean in time.
     error:
         Standard deviation of its noise.
-    parts:
-        ``(P, H, W)`` means over consecutive parts of the stack.
     frames:
         ``(K, H, W)`` log(I / I₀), all of them.
     drift:
@@ -66,21 +65,26 @@ class Standing:
 
     image: Array
     error: float
-    parts: Array
     frames: Stack
     drift: Array
 
     @classmethod
     def of(cls, frames: Stack, noise: float) -> Self:
         """Summarise ``(K, H, W)`` log(I / I₀) with pixel noise of a standard deviation `noise`."""
-        parts = [_mean(part) for part in np.array_split(frames, min(_PARTS, len(frames)))]
-        return cls(_mean(frames), noise / np.sqrt(len(frames)), np.array(parts), frames, _drift(frames))
+        return cls(_mean(frames), noise / np.sqrt(len(frames)), frames, _drift(frames))
 
     @cached_property
     def changes(self) -> Array:
-        """Variance of what is sharp in the mean, told by how the parts differ, ``(H, W)``."""
-        sharp = np.array([_sharp(part) for part in self.parts])
-        return np.asarray(ndimage.gaussian_filter(sharp.var(axis=0, ddof=1), _SHARP[1]) / len(sharp))
+        """``(H, W)`` variance of what is sharp in the mean, told by how parts of the stack differ."""
+        parts = np.array_split(self.frames, min(_PARTS, len(self.frames)))
+        total, squares = np.zeros((2, *self.image.shape))
+        for part in parts:
+            sharp = _sharp(_mean(part))
+            total += sharp
+            squares += sharp**2
+        squares -= total**2 / len(parts)
+        variance = np.maximum(squares, 0) / (len(parts) - 1)
+        return np.asarray(ndimage.gaussian_filter(variance, _SHARP[1]) / len(parts))
 
 
 def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
@@ -327,7 +331,8 @@ def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
     square = np.sum(np.broadcast_to(spot, series.shape) ** 2, axis=0)
     product = np.sum(spot * series, axis=0)
     share = product.sum() / square.sum()
-    return product / square, 2 * share * product - share**2 * square
+    # the spot may have left the window
+    return product / np.maximum(square, _NOTHING), 2 * share * product - share**2 * square
 
 
 def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> Array:

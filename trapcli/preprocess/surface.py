@@ -442,8 +442,10 @@ def _around(hidden: Bools) -> tuple[slice, slice]:
 
 
 def _noise_of_pixels(residuals: _Residuals) -> float:
-    some = np.array(list(islice(residuals, _NOISE_FRAMES)))
-    return _noise(some, border(some.shape[1:]))
+    """Return the standard deviation of a pixel's noise, from the upper and the lower border."""
+    edge = border(residuals.field.shape)
+    rows = edge.all(axis=1)
+    return _noise(np.array([image[rows] for image in islice(residuals, _NOISE_FRAMES)]), edge[rows])
 
 
 def _is_tilted(ratios: Stack, quiet: Bools, noise: float, cells: Cells) -> bool:
