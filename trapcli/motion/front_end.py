@@ -41,6 +41,7 @@ _COARSE = 256  # pixels across on which the radius is measured
 _BLOCK_BYTES = 8 << 20
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the models' own errors dominate
 _LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
+_MOST_HIDDEN = 1.4  # radius of the object, in units of what the noise lets us see, at most
 
 
 @dataclass(frozen=True)
@@ -158,9 +159,15 @@ def _look(attenuation: Frames) -> _Look:
     images = np.array(coarse)
     noise, b = float(np.median(noises or [pixel_noise(first[None])])), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
-    noises_of_cells = noise / b, max(noise, _LEAST_VISIBLE * peak) / b
-    reach, radius = (b * r for r in in_parallel(partial(object_radius, images), noises_of_cells))
-    return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, min(radius, reach))
+    faintest = _LEAST_VISIBLE * peak
+    visible = max(noise, faintest)
+    levels = noise / b, visible / b, 2 * visible / b
+    reach, radius, inner = (b * r for r in in_parallel(partial(object_radius, images), levels))
+    # what the noise hides of the object goes on falling, as a Gaussian does, as it fell before
+    hidden = float(np.log2(visible / faintest)) if faintest > 0 else 0.0
+    whole = np.sqrt(radius**2 + hidden * max(radius**2 - inner**2, 0.0))
+    radius = min(whole, _MOST_HIDDEN * radius)
+    return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, radius)
 
 
 def _averaged(attenuation: Frames, cells: Cells) -> Iterator[list[NDArray[Any]]]:

@@ -11,6 +11,12 @@ centre, the imaginary part the odd one, so that the normal matrix falls into two
 The object follows the noise as well: on the average the misfit lacks as much as the number of amplitudes that
 the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. Both together are
 minimized; their mean over the noise does not favour motions that see more.
+
+What the object holds of the noise turns with the motion as well. On the average it adds the same matrix T to
+the normal matrix J of the motion and to the covariance of the gradient, as the noise in the object and the
+noise that is left over are independent: the misfit bends by M = J − T only, and what the frames tell of the
+motion is M J⁻¹ M (Godambe 1960, DOI 10.1214/aoms/1177705693). T is the normal matrix of objects that are
+fitted to noise alone.
 """
 
 from __future__ import annotations
@@ -37,6 +43,8 @@ ComplexArray = NDArray[np.complex128]
 _GUARD = 6.0  # half the gap between the band and its periodic image, times the object's radius
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
+_PROBES = 2  # objects that are fitted to noise alone
+_MOST_NOISE = 0.9  # share that noise may have of a normal matrix
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
 _CONVERGED = 0.1  # gain in misfit, in units of a noise's, that ends the search
@@ -62,6 +70,8 @@ class Fit:
         Misfit to the data.
     roughness:
         What counted beside the misfit; None where the spline alone smoothes.
+    by_noise:
+        ``(3 · size, 3 · size)`` what noise in the object adds to the normal matrix of the motion.
     axes:
         Lab axes about which the path was bent.
     """
@@ -72,6 +82,7 @@ class Fit:
     spline: Spline
     cost: float
     roughness: Roughness | None
+    by_noise: Array
     axes: tuple[int, ...] = (0, 1, 2)
 
 
@@ -194,12 +205,14 @@ class ObjectModel:
         roughness = Roughness(spline, axes) if smooth else None
         bent = _coefficients(spline, axes)
         now = self._tried(path, np.zeros((groups, 2)))
+        state = self._linearized(now.views, now.modes, now.solution)
+        by_noise = self._noise_hessian(now.views, state, values)
         for _ in range(steps):
-            state = self._linearized(now.views, now.modes, now.solution)
             eliminated = self._eliminated(now.views, state, values)
             downhill, still, hope = self._downhill(now.views, state, eliminated, values)
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
-            downhill = downhill[bent]
+            informed = _informed(hessian, by_noise[np.ix_(bent, bent)])
+            hessian, downhill = informed @ hessian @ informed.T, informed @ downhill[bent]
             if roughness is not None:
                 # far from the motion the misfit is large, and must not call for wiggles
                 excess = max(1.0, state.cost / self._degrees(groups))
@@ -218,8 +231,9 @@ class ObjectModel:
             gain, now = self._search(now, spline, step, still, follow, roughness)
             if gain < _CONVERGED:
                 break
+            state = self._linearized(now.views, now.modes, now.solution)
         low, cost = self.low.shifted(now.shift), now.solution.cost
-        return Fit(now.path, low, now.shift, spline, cost, roughness, axes)
+        return Fit(now.path, low, now.shift, spline, cost, roughness, by_noise, axes)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -235,11 +249,11 @@ class ObjectModel:
         size = values.shape[1]
         bent = np.ix_(*2 * (_coefficients(fit.spline, fit.axes),))
         known = _pinned(hessian, R, values)[bent]
-        if fit.roughness is not None:
-            known += fit.roughness.curvature(fit.path, len(values))
+        rough = 0.0 if fit.roughness is None else fit.roughness.curvature(fit.path, len(values))
+        parameters = float(np.trace(np.linalg.solve(known + rough, hessian[bent])))
+        informed = _informed(known, fit.by_noise[bent])
         covariance = np.zeros_like(hessian)
-        covariance[bent] = np.linalg.inv(known)
-        parameters = float(np.sum(covariance * hessian))
+        covariance[bent] = np.linalg.inv(informed @ known @ informed.T + rough)
         degrees = max(self.data_count - views.seen - parameters - 2 * self.weights.sum(), 1.0)
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
@@ -476,6 +490,19 @@ class ObjectModel:
         direct = bent_blocks(values, every, every, own)
         return Eliminated(direct - flat.T @ solution, solution, block, inverse, carry)
 
+    def _noise_hessian(self, views: _Views, state: _State, values: Array) -> Array:
+        """Return the ``(P, P)`` mean normal matrix of a motion of objects that are fitted to noise alone."""
+        rng = np.random.default_rng(0)
+        slopes, total = state.slopes.copy(), np.zeros(2 * (3 * values.shape[1],))
+        for _ in range(_PROBES):
+            real, imaginary = rng.standard_normal((2, *self._root.shape))
+            # a mode that stands for itself alone is real
+            noise = real + 1j * (self._share > 1) * imaginary
+            _, turned = self._model(views.R, views.points, views.solve(self._right(views, noise)))
+            slopes[..., :3] = turned[..., :3] * self._root[..., None]
+            total += self._eliminated(views, replace(state, slopes=slopes), values).hessian / _PROBES
+        return total
+
     def _shift_columns(self, views: _Views, state: _State, part: slice) -> Array:
         return self._back_projected(views.R[part], state.slopes[part, :, 3:] * self._gain[part, :, None])
 
@@ -627,6 +654,14 @@ def _shift_covariance(shifts: ComplexArray) -> Array:
     curvature = np.einsum("gki,gkj->gij", shifts.conj(), shifts).real
     curvature += 1e-12 * np.trace(curvature, axis1=1, axis2=2).max() * np.eye(2) + 1e-300 * np.eye(2)
     return np.asarray(np.linalg.inv(curvature), float)
+
+
+def _informed(hessian: Array, by_noise: Array) -> Array:
+    """Return M J⁻¹ for a normal matrix J and M = J less what noise adds to it."""
+    share, ways = scipy.linalg.eigh(by_noise, hessian, check_finite=False)
+    # ways diagonalize both: waysᵀ J ways = 1
+    told = 1 - np.clip(share, 0.0, _MOST_NOISE)
+    return np.asarray((hessian @ ways * told) @ ways.T)
 
 
 def _pinned(hessian: Array, R: Array, values: Array) -> Array:
