@@ -240,7 +240,8 @@ def test_rotation_about_the_optical_axis(few_starts: None) -> None:
     assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 0.2
 
 
-def test_an_axis_near_the_optical_one_is_not_taken_for_it(few_starts: None) -> None:
+@pytest.mark.slow
+def test_an_axis_near_the_optical_one_is_not_taken_for_it() -> None:
     images, truth = render("single-axis", "blobs", seed=2, tilt=80.0)
     found = estimate(images, truth.time)
     assert found.identifiable

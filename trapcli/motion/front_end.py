@@ -26,7 +26,7 @@ from trapcli.motion.centers import (
     pixel_noise,
     spread,
 )
-from trapcli.motion.low_band import LowBand, LowBandReader
+from trapcli.motion.low_band import SQUARE, LowBand, LowBandReader
 from trapcli.motion.reduced_map import BandReader
 from trapcli.motion.threads import in_parallel
 from trapcli.motion.types import ReducedMap
@@ -91,7 +91,8 @@ def read_front_end(
     cells = Cells.for_radius(shape, look.radius)
     radius, b = look.radius * pixel_size, cells.binning
     tracker = Tracker(n, look.pixel_noise / b, look.reach / b)
-    lines = BandReader(n, radius, min(line_band / radius, band or np.inf), pixel_size, b)
+    visible = look.visible * pixel_size
+    lines = BandReader(n, visible, min(line_band / visible, band or np.inf), pixel_size, b)
     low = LowBandReader(n, radius, band or fine_band / radius, pixel_size, b)
     half = max(lines.half, low.half)
     whole = np.zeros((n, 2), int)
@@ -121,14 +122,15 @@ class _Look:
     ----------
     pixel_noise, noise:
         Standard deviation of the noise of one pixel as measured, and as it is to be taken.
-    reach, radius:
-        Distance from the centre up to which the object stands out of the noise, and to which it is to be
-        taken [pixels].
+    reach, visible, radius:
+        Distance from the centre up to which anything stands out of the noise, up to which the object does,
+        and to which it may go on [pixels].
     """
 
     pixel_noise: float
     noise: float
     reach: float
+    visible: float
     radius: float
 
 
@@ -155,19 +157,20 @@ def _look(attenuation: Frames) -> _Look:
             coarse.append(np.array(averaged, float))
     if not coarse:
         farthest = float(np.hypot(*shape))
-        return _Look(0.0, 0.0, farthest, farthest)
+        return _Look(0.0, 0.0, farthest, farthest, farthest)
     images = np.array(coarse)
     noise, b = float(np.median(noises or [pixel_noise(first[None])])), cells.binning
     peak = float(np.quantile(images, 0.9999) - np.median(images))
     faintest = _LEAST_VISIBLE * peak
-    visible = max(noise, faintest)
-    levels = noise / b, visible / b, 2 * visible / b
-    reach, radius, inner = (b * r for r in in_parallel(partial(object_radius, images), levels))
+    least = max(noise, faintest)
+    levels = noise / b, least / b, 2 * least / b
+    reach, visible, inner = (b * r for r in in_parallel(partial(object_radius, images), levels))
     # what the noise hides of the object goes on falling, as a Gaussian does, as it fell before
-    hidden = float(np.log2(visible / faintest)) if faintest > 0 else 0.0
-    whole = np.sqrt(radius**2 + hidden * max(radius**2 - inner**2, 0.0))
-    radius = min(whole, _MOST_HIDDEN * radius)
-    return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, radius)
+    hidden = float(np.log2(least / faintest)) if faintest > 0 else 0.0
+    whole = float(np.sqrt(visible**2 + hidden * max(visible**2 - inner**2, 0.0)))
+    # but no farther than the frame does
+    radius = min(whole, _MOST_HIDDEN * visible, max(visible, min(shape) / 2 / SQUARE))
+    return _Look(noise, max(noise, _LEAST_NOISE * peak), reach, visible, radius)
 
 
 def _averaged(attenuation: Frames, cells: Cells) -> Iterator[list[NDArray[Any]]]:

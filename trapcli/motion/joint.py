@@ -127,7 +127,7 @@ def estimate_joint(
         fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
         best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
         refined += len(fits)
-        if judge(*best).identifiable or refined >= _MOST_REFINED:
+        if best[0].cost <= CERTIFIED * best[1].degrees or refined >= _MOST_REFINED:
             break
     assert best is not None
     fit, assessment = best

@@ -22,7 +22,7 @@ from trapcli.result.motion import Flag, Motion
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-CERTIFIED = 1.08
+CERTIFIED = 1.06
 """Misfit per degree of freedom that pixel noise explains."""
 
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
