@@ -134,6 +134,12 @@ def test_sharp_edges_are_no_noise(noise: float) -> None:
         assert pixel_noise(images) > 1.2 * noise
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.int32])
+def test_noise_of_whole_numbers(kind: type[np.integer]) -> None:
+    images = 40 + 100 * turning_grain(4, 0.05)
+    assert noise_of_pairs(images.round().astype(kind)) == pytest.approx(noise_of_pairs(images), rel=0.02)
+
+
 @pytest.mark.parametrize("how", ["repeated", "interpolated"])
 def test_noise_that_goes_on_into_the_next_frame_is_told_by_each(how: str) -> None:
     images = turning_grain(17, 0.2)

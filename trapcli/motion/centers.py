@@ -204,6 +204,8 @@ def noise_between(image: NDArray[Any], following: NDArray[Any]) -> float:
     what changes is the noise, unless that itself is repeated or interpolated in time: then each image is
     judged alone.
     """
+    # differences of unsigned counts would wrap around
+    image, following = (np.asarray(i, np.result_type(i, np.float32)) for i in (image, following))
     if min(image.shape) < 2 * _LEAST_RIM or not np.isfinite(following).all():
         return pixel_noise(image[None])
     change = (following - image) / np.sqrt(2).astype(image.dtype)
