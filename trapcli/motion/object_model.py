@@ -70,10 +70,10 @@ class Fit:
         Misfit to the data.
     roughness:
         What counted beside the misfit; None where the spline alone smoothes.
-    by_noise:
-        ``(3 · size, 3 · size)`` what noise in the object adds to the normal matrix of the motion.
     axes:
         Lab axes about which the path was bent.
+    normal:
+        The normal equations at the motion, for the model that fitted it; None where they are not known.
     """
 
     path: Path
@@ -82,8 +82,8 @@ class Fit:
     spline: Spline
     cost: float
     roughness: Roughness | None
-    by_noise: Array
     axes: tuple[int, ...] = (0, 1, 2)
+    normal: Normal | None = None
 
 
 @dataclass(frozen=True)
@@ -205,10 +205,13 @@ class ObjectModel:
         roughness = Roughness(spline, axes) if smooth else None
         bent = _coefficients(spline, axes)
         now = self._tried(path, np.zeros((groups, 2)))
-        state = self._linearized(now.views, now.modes, now.solution)
-        by_noise = self._noise_hessian(now.views, state, values)
+        normal: Normal | None = None
+        by_noise: Array | None = None
         for _ in range(steps):
+            state = self._linearized(now.views, now.modes, now.solution)
             eliminated = self._eliminated(now.views, state, values)
+            if by_noise is None:
+                by_noise = self._noise_hessian(now.views, state, values)
             downhill, still, hope = self._downhill(now.views, state, eliminated, values)
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
             informed = _informed(hessian, by_noise[np.ix_(bent, bent)])
@@ -224,6 +227,7 @@ class ObjectModel:
             step.flat[bent] = np.linalg.solve(hessian, downhill)
             hope += float(downhill @ step.flat[bent])
             if hope < _CONVERGED:
+                normal = Normal(now.views, state, eliminated, by_noise)
                 break
             follow = self._follow(
                 now.views, state, eliminated, values @ step, eliminated.solution @ step.ravel()
@@ -231,9 +235,8 @@ class ObjectModel:
             gain, now = self._search(now, spline, step, still, follow, roughness)
             if gain < _CONVERGED:
                 break
-            state = self._linearized(now.views, now.modes, now.solution)
         low, cost = self.low.shifted(now.shift), now.solution.cost
-        return Fit(now.path, low, now.shift, spline, cost, roughness, by_noise, axes)
+        return Fit(now.path, low, now.shift, spline, cost, roughness, axes, normal)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -242,16 +245,14 @@ class ObjectModel:
     def assess(self, fit: Fit) -> Assessment:
         """Return degrees of freedom, covariance and the misfit of each frame and mode of a fit."""
         values = fit.spline.values(fit.low.time)
-        R = fit.path.R[-len(values) :]
-        views = self._views(R)
-        state = self._state(views, fit.low.modes)
-        hessian = self._eliminated(views, state, values).hessian
+        normal = fit.normal or self._normal(fit, values)
+        views, state, hessian = normal.views, normal.state, normal.eliminated.hessian
         size = values.shape[1]
         bent = np.ix_(*2 * (_coefficients(fit.spline, fit.axes),))
-        known = _pinned(hessian, R, values)[bent]
+        known = _pinned(hessian, views.R, values)[bent]
         rough = 0.0 if fit.roughness is None else fit.roughness.curvature(fit.path, len(values))
         parameters = float(np.trace(np.linalg.solve(known + rough, hessian[bent])))
-        informed = _informed(known, fit.by_noise[bent])
+        informed = _informed(known, normal.by_noise[bent])
         covariance = np.zeros_like(hessian)
         covariance[bent] = np.linalg.inv(informed @ known @ informed.T + rough)
         degrees = max(self.data_count - views.seen - parameters - 2 * self.weights.sum(), 1.0)
@@ -263,6 +264,12 @@ class ObjectModel:
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),
             middle=self._middle(state),
         )
+
+    def _normal(self, fit: Fit, values: Array) -> Normal:
+        views = self._views(fit.path.R[-len(values) :])
+        state = self._state(views, fit.low.modes)
+        eliminated = self._eliminated(views, state, values)
+        return Normal(views, state, eliminated, self._noise_hessian(views, state, values))
 
     def locate(self, fit: Fit, covariance: Array, R: Array, low: LowBand) -> tuple[Array, Array]:
         """Find the middle of the fitted object in single frames.
@@ -637,6 +644,16 @@ def _parts(count: int) -> Iterator[slice]:
 def _coefficients(spline: Spline, axes: tuple[int, ...]) -> NDArray[np.intp]:
     """Return the places of the coefficients of some axes among all."""
     return (3 * np.arange(spline.size)[:, None] + axes).ravel()
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations of a motion, and what noise in the object adds to them, ``(P, P)``."""
+
+    views: _Views
+    state: _State
+    eliminated: Eliminated
+    by_noise: Array
 
 
 @dataclass(frozen=True)
