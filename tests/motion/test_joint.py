@@ -227,7 +227,7 @@ def test_a_cell_by_wave_optics() -> None:
 
 
 @pytest.mark.slow
-def test_rotation_about_the_optical_axis(few_starts: None) -> None:
+def test_rotation_about_the_optical_axis() -> None:
     """Seen from one side only: ω₃ is known, α is 0 within its error, φ is undefined."""
     images, truth = render("single-axis", "blobs", seed=2, tilt=90.0)
     found = estimate(images, truth.time)
@@ -236,7 +236,10 @@ def test_rotation_about_the_optical_axis(few_starts: None) -> None:
     assert (found.flags & np.uint16(Flag.ALPHA_ZERO) > 0).all()
     assert np.isnan(found.phi).all()
     assert (found.alpha < 2 * found.alpha_errors).all()
-    assert found.omega_3 == pytest.approx(truth.omega_3, rel=0.05)
+    off = np.abs(found.omega_3 / truth.omega_3 - 1)
+    assert np.median(off) < 0.02
+    # at both ends a rate is told by one side only
+    assert off.max() < 0.1
     assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 0.2
 
 

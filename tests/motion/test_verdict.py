@@ -42,7 +42,7 @@ def test_rotation_about_the_optical_axis_with_model_error() -> None:
     """Blotches that are no noise of pixels widen the errors; α stays 0 within its error, φ undefined."""
     images, truth = scene(tilt=90.0)
     blotches = gaussian_filter(np.random.default_rng(5).normal(size=images.shape), (0, 2, 2))
-    images = images + (0.003 * images.max() * blotches / blotches.std()).astype(np.float32)
+    images = images + (0.0025 * images.max() * blotches / blotches.std()).astype(np.float32)
     found = estimate(images, truth.time)
     assert found.identifiable
     assert "imperfect model" in found.verdict
