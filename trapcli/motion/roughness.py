@@ -1,10 +1,9 @@
 """How fast ω(t) may change, found from the data: a penalty on its roughness, chosen by its evidence.
 
-The fourth differences of ω on a fine grid are taken to be Gaussian with a variance of their own, as in a
+The second differences of ω on a fine grid are taken to be Gaussian with a variance of their own, as in a
 smoothing spline; the variance is the one under which the data are likeliest, the motion integrated out in the
 quadratic approximation of the misfit. Errors then hold what the penalty may have smoothed away (Wahba 1983,
-DOI 10.1111/j.2517-6161.1983.tb01239.x). A penalty on lower differences that lets the long waves of a smooth
-motion pass lets more of the noise in its short ones pass as well.
+DOI 10.1111/j.2517-6161.1983.tb01239.x).
 """
 
 from __future__ import annotations
@@ -21,14 +20,13 @@ from trapcli.motion.path import Path, Spline, cross_matrix
 
 Array = NDArray[np.float64]
 
-_RANGE = (-8.0, 10.0)  # decades of the weight about the one that is as stiff as the misfit
-_ORDER = 4  # of the differences
-_FREE = _ORDER + 1  # for each axis: a constant rotation and an ω that is a cubic in time cost nothing
+_RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
+_FREE = 3  # for each axis: a constant rotation and an ω that is linear in time cost nothing
 
 
 @dataclass(frozen=True)
 class Roughness:
-    """``weight · |fourth differences of ω|²``, on the grid of a spline that bends the path.
+    """``weight · |second differences of ω|²``, on the grid of a spline that bends the path.
 
     Paths hold the grid, followed by a number of other times, `after`.
 
@@ -39,7 +37,7 @@ class Roughness:
     axes:
         Lab axes about which the path is bent, out of 0, 1, 2; P coefficients in all.
     weight:
-        In units of the misfit for fourth differences [rad].
+        In units of the misfit for second differences [rad].
     """
 
     spline: Spline
@@ -89,7 +87,7 @@ class Roughness:
         return np.asarray((self._difference() @ self._omega(path, after)).ravel())
 
     def _design(self, path: Path, after: int) -> Array:
-        """Return the derivatives of the differences by the spline's coefficients."""
+        """Return the derivatives of the second differences by the spline's coefficients."""
         grid, omega = self.spline.grid, self._omega(path, after)
         change = np.einsum("mb,ij->mibj", self.spline.slopes(grid), np.eye(3))
         # δω = δ' + ω × δ
@@ -99,7 +97,7 @@ class Roughness:
 
     def _difference(self) -> Array:
         grid = self.spline.grid
-        return np.asarray((grid[1] - grid[0]) * np.diff(np.eye(len(grid)), _ORDER, axis=0))
+        return np.asarray((grid[1] - grid[0]) * np.diff(np.eye(len(grid)), 2, axis=0))
 
     def _omega(self, path: Path, after: int) -> Array:
         last = len(path.time) - after
