@@ -41,6 +41,7 @@ _COARSE = 256  # pixels across on which the radius is measured
 _BLOCK_BYTES = 8 << 20
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the models' own errors dominate
 _LEAST_VISIBLE = 5e-3  # share of the peak at which the object ends
+_HIDDEN = 4.0  # noise, in units of that, from which on it hides a part that matters
 _MOST_HIDDEN = 1.4  # radius of the object, in units of what the noise lets us see, at most
 
 
@@ -166,7 +167,7 @@ def _look(attenuation: Frames) -> _Look:
     levels = noise / b, least / b, 2 * least / b
     reach, visible, inner = (b * r for r in in_parallel(partial(object_radius, images), levels))
     # what the noise hides of the object goes on falling, as a Gaussian does, as it fell before
-    hidden = float(np.log2(least / faintest)) if faintest > 0 else 0.0
+    hidden = max(float(np.log2(least / (_HIDDEN * faintest))), 0.0) if faintest > 0 else 0.0
     whole = float(np.sqrt(visible**2 + hidden * max(visible**2 - inner**2, 0.0)))
     # but no farther than the frame does
     radius = min(whole, _MOST_HIDDEN * visible, max(visible, min(shape) / 2 / SQUARE))
