@@ -443,7 +443,7 @@ class ObjectModel:
         self, views: _Views, state: _State, eliminated: Eliminated, turn: Array, answer: Array
     ) -> Array:
         """Return the ``(G, 2)`` shifts that follow ``(G, 3)`` turns and minus an ``(n,)`` folded object."""
-        waves = self._gain * self._waves(views.points, [_unfolded(answer)])[0] / self._blob
+        waves = self._root * self._waves(views.points, [_unfolded(answer)])[0]
         pull = np.einsum("gki,gk->gi", state.slopes[..., 3:].conj(), waves).real
         pull = np.einsum("gij,gj->gi", eliminated.shift_covariance, pull)
         return _without_drift(pull - np.einsum("gji,gj->gi", eliminated.carry, turn), views.R)

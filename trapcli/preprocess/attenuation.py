@@ -36,6 +36,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+_FROM_ALL_FRAMES = ("auto", "median", "surface")  # backgrounds that many frames together tell
 _FLAGGED = 0.01  # share of pixels without light, or too bright, beyond which a frame can't be judged
 _LEAVES = 0.6  # share of the frames in which a pixel must be free for a median in time
 _COVERED = 0.01  # share of the pixels that may be free less often
@@ -198,7 +199,7 @@ def _known(attenuation: NDArray[Any], unknown: Bools, cells: Cells) -> NDArray[A
 
 
 def _background(frames: Frames, source: str, roi: tuple[int, ...], counts: Counts) -> _Background:
-    guessed = source in ("auto", "median", "surface")
+    guessed = source in _FROM_ALL_FRAMES
     sample = counts.sample(frames, _FLAGGED) if guessed else counts.sample(frames, _FLAGGED, _LOOKS)
     found = _with_particle(_find_background(frames, source, roi, counts, sample), frames, sample)
     doubts = []
@@ -250,7 +251,7 @@ def _find_background(
         return _Background(_above_border(shape, 2), "background: a surface through the border")
     if source == "none":
         return _Background(_above_border(shape, 0), "background: none, a flat field")
-    if source not in ("auto", "median", "surface"):
+    if source not in _FROM_ALL_FRAMES:
         light = mean_image(frames, source, roi, "background") - counts.dark
         field = np.log(np.where(light > 0, light, np.nan))
         return _Background(_lit_by_border(field), f"background: {source}")
@@ -303,7 +304,8 @@ def _lit(field: NDArray[Any], light: Light) -> Callable[[NDArray[Any]], NDArray[
     double = np.nan_to_num(field)
     single = double.astype(np.float32)
 
-    looked, halved = _cells(field.shape), Cells(grid(_cells(field.shape)), 2)
+    looked = _cells(field.shape)
+    halved = Cells(grid(looked), 2)
 
     def attenuation(logs: NDArray[Any]) -> NDArray[Any]:
         np.subtract(single if logs.dtype == np.float32 else double, logs, out=logs)
