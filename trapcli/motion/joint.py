@@ -247,9 +247,13 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     planar = model.fit(fit.path.planar(), fit.low.time, fit.spline, smooth=smooth, axes=(2,))
     simpler = model.assess(planar)
     misfit = max(fit.cost / assessment.degrees, 1.0)
-    # seen from one side only, the object has fewer parameters too
-    fewer = max(simpler.degrees - assessment.degrees, 0.0)
-    if planar.cost - fit.cost >= misfit * (fewer + _SIGNIFICANT * np.sqrt(2 * fewer)):
+    # seen from one side only, the object has fewer parameters too. Turns out of the plane times what they show of
+    # it are fitted to noise like the largest singular values of a random matrix (Davidson and Szarek 2001,
+    # DOI 10.1016/S1874-5849(01)80010-3)
+    turns = max(assessment.parameters - simpler.parameters, 0.0)
+    shown = max(simpler.degrees - assessment.degrees - turns, 0.0)
+    by_noise = (np.sqrt(shown) + np.sqrt(turns) + _SIGNIFICANT / np.sqrt(2)) ** 2
+    if planar.cost - fit.cost >= misfit * by_noise:
         return fit, assessment
     # how far out of the image plane it might turn is what the richer motion tells
     return planar, replace(simpler, covariance=assessment.covariance)

@@ -94,6 +94,8 @@ class Assessment:
     ----------
     degrees:
         Expected misfit: ``fit.cost / degrees`` is 1 where the noise explains it.
+    parameters:
+        How many numbers of the motion the frames determine.
     covariance:
         ``(size, 3, size, 3)`` covariance of the spline's coefficients.
     frame_misfit, mode_misfit:
@@ -103,6 +105,7 @@ class Assessment:
     """
 
     degrees: float
+    parameters: float
     covariance: Array
     frame_misfit: Array
     mode_misfit: Array
@@ -259,6 +262,7 @@ class ObjectModel:
         power = np.abs(state.residual) ** 2 * self.data_count / degrees
         return Assessment(
             degrees=degrees,
+            parameters=parameters,
             covariance=covariance.reshape(size, 3, size, 3),
             frame_misfit=power.sum(axis=1) / (self._share.sum() * np.maximum(self.weights, 1e-300)),
             mode_misfit=power.sum(axis=0) / (self._share * self.weights.sum()),

@@ -65,11 +65,12 @@ class Verdict:
 def judge(fit: Fit, assessment: Assessment) -> Verdict:
     """Say whether the misfit is what the noise leaves, or what else it is."""
     misfit = fit.cost / assessment.degrees
+    planar = "; it turns about the optical axis alone, as far as can be told: phi is undefined"
+    about = planar if fit.axes == (2,) else ""
     if misfit <= CERTIFIED:
-        text = f"the motion explains the images: misfit {misfit:.3f} of what the noise gives"
-        if fit.axes == (2,):
-            text += "; it turns about the optical axis alone, as far as can be told: phi is undefined"
-        return Verdict(True, text)
+        return Verdict(
+            True, f"the motion explains the images: misfit {misfit:.3f} of what the noise gives{about}"
+        )
     changing = np.abs(fit.low.modes - fit.low.modes.mean(axis=0)) ** 2
     share = conjugate_share(fit.low.k)
     left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
@@ -78,7 +79,7 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
         return Verdict(
             True,
             f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
-            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it",
+            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it{about}",
             error,
         )
     return Verdict(
