@@ -36,7 +36,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 
 _SURVEY = 32  # frames that are looked at first
-_SURVEY_PIXELS = 4 << 20  # that the noise is measured on
+_SURVEY_PIXELS = 2 << 20  # that the noise is measured on
 _COARSE = 256  # pixels across on which the radius is measured
 _BLOCK_BYTES = 8 << 20
 _LEAST_NOISE = 1e-3  # noise, as a share of the peak, below which the models' own errors dominate
@@ -143,7 +143,7 @@ def _look(attenuation: Frames) -> _Look:
     noises: list[float] = []
     coarse: list[Array] = []
     wanted = spread(len(attenuation), _SURVEY)
-    pairs = wanted[spread(len(wanted), few)]
+    pairs = spread(len(attenuation), few) if few > len(wanted) else wanted[spread(len(wanted), few)]
     both = np.union1d(wanted, np.minimum(pairs + 1, len(attenuation) - 1))
     first, last = np.empty(0), -2
     for position, image in zip(both, attenuation.pick(both), strict=True):

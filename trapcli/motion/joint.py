@@ -247,8 +247,8 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     planar = model.fit(fit.path.planar(), fit.low.time, fit.spline, smooth=smooth, axes=(2,))
     simpler = model.assess(planar)
     misfit = max(fit.cost / assessment.degrees, 1.0)
-    # seen from one side only, the object has fewer parameters too. Turns out of the plane times what they show of
-    # it are fitted to noise like the largest singular values of a random matrix (Davidson and Szarek 2001,
+    # seen from one side only, the object has fewer parameters too. Turns out of the plane times what they
+    # show of it fit noise as the largest singular values of a random matrix do (Davidson and Szarek 2001,
     # DOI 10.1016/S1874-5849(01)80010-3)
     turns = max(assessment.parameters - simpler.parameters, 0.0)
     shown = max(simpler.degrees - assessment.degrees - turns, 0.0)

@@ -79,7 +79,8 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
         return Verdict(
             True,
             f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
-            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it{about}",
+            f"{misfit:.1f} times the noise, is put down to an imperfect model, and errors are widened for it"
+            + about,
             error,
         )
     return Verdict(
