@@ -51,7 +51,7 @@ def conjugate_share(k: Array) -> Array:
     return np.where((k == 0).all(axis=1), 1.0, 2.0)
 
 
-def project(points: list[Array], lattice: Real | Complex) -> Complex:
+def project(points: list[Array], lattice: Real | Complex, accuracy: float = _DOUBLE_PRECISION) -> Complex:
     """Return ``Σ_b lattice[b] exp(−i⟨point, b⟩)``, the modes of an object on a lattice.
 
     Parameters
@@ -61,6 +61,8 @@ def project(points: list[Array], lattice: Real | Complex) -> Complex:
     lattice:
         ``(..., n, n, n)`` in the order x1, x2, x3; lattice point b = 0 at index n // 2. Single or double
         precision decides that of the result.
+    accuracy:
+        Relative to the largest modes, in double precision.
 
     Returns
     -------
@@ -71,7 +73,10 @@ def project(points: list[Array], lattice: Real | Complex) -> Complex:
     kind = np.complex64 if single else np.complex128
     return np.asarray(
         finufft.nufft3d2(
-            *_in_precision(points, single), lattice.astype(kind, copy=False), isign=-1, **_options(single)
+            *_in_precision(points, single),
+            lattice.astype(kind, copy=False),
+            isign=-1,
+            **_options(single, accuracy),
         )
     )
 
@@ -102,10 +107,10 @@ def _in_precision(points: list[Array], single: bool) -> list[Real]:
     return [p.astype(np.float32 if single else np.float64, copy=False) for p in points]
 
 
-def _options(single: bool) -> dict[str, Any]:
+def _options(single: bool, accuracy: float = _DOUBLE_PRECISION) -> dict[str, Any]:
     if single:
         return {"eps": _SINGLE_PRECISION, "upsampfac": _SPARE, "nthreads": processors()}
-    return {"eps": _DOUBLE_PRECISION, "nthreads": processors()}
+    return {"eps": accuracy, "upsampfac": 2.0, "nthreads": processors()}
 
 
 class NormalOperator:

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,7 @@ _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
 _CONVERGED = 0.1  # gain in misfit, in units of a noise's, that ends the search
+_FAITHFUL = 1e-10  # accuracy of the modes of an object: far below noise of 0.1 % of the peak
 _AT_ONCE = 64  # frames whose waves on the lattice are held at once
 _CACHED = 256  # lattice points whose waves fit into a processor's cache
 
@@ -72,8 +74,10 @@ class Fit:
         What counted beside the misfit; None where the spline alone smoothes.
     axes:
         Lab axes about which the path was bent.
-    normal:
-        The normal equations at the motion, for the model that fitted it; None where they are not known.
+    model:
+        What was fitted, about the centres that the data had before.
+    known:
+        Its normal equations at the motion, where the search has told them.
     """
 
     path: Path
@@ -82,8 +86,14 @@ class Fit:
     spline: Spline
     cost: float
     roughness: Roughness | None
-    axes: tuple[int, ...] = (0, 1, 2)
-    normal: Normal | None = None
+    axes: tuple[int, ...]
+    model: ObjectModel
+    known: Normal | None = None
+
+    @cached_property
+    def normal(self) -> Normal:
+        """The model's normal equations at the motion."""
+        return self.known or self.model.normal(self)
 
 
 @dataclass(frozen=True)
@@ -214,7 +224,7 @@ class ObjectModel:
             state = self._linearized(now.views, now.modes, now.solution)
             eliminated = self._eliminated(now.views, state, values)
             if by_noise is None:
-                by_noise = self._noise_hessian(now.views, state, values)
+                by_noise = self._noise_hessian(now.views, state, eliminated, values)
             downhill, still, hope = self._downhill(now.views, state, eliminated, values)
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
             informed = _informed(hessian, by_noise[np.ix_(bent, bent)])
@@ -239,7 +249,7 @@ class ObjectModel:
             if gain < _CONVERGED:
                 break
         low, cost = self.low.shifted(now.shift), now.solution.cost
-        return Fit(now.path, low, now.shift, spline, cost, roughness, axes, normal)
+        return Fit(now.path, low, now.shift, spline, cost, roughness, axes, self, normal)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -248,7 +258,7 @@ class ObjectModel:
     def assess(self, fit: Fit) -> Assessment:
         """Return degrees of freedom, covariance and the misfit of each frame and mode of a fit."""
         values = fit.spline.values(fit.low.time)
-        normal = fit.normal or self._normal(fit, values)
+        normal = fit.normal
         views, state, hessian = normal.views, normal.state, normal.eliminated.hessian
         size = values.shape[1]
         bent = np.ix_(*2 * (_coefficients(fit.spline, fit.axes),))
@@ -269,11 +279,13 @@ class ObjectModel:
             middle=self._middle(state),
         )
 
-    def _normal(self, fit: Fit, values: Array) -> Normal:
+    def normal(self, fit: Fit) -> Normal:
+        """Return the normal equations at a fit of this model."""
+        values = fit.spline.values(fit.low.time)
         views = self._views(fit.path.R[-len(values) :])
         state = self._state(views, fit.low.modes)
         eliminated = self._eliminated(views, state, values)
-        return Normal(views, state, eliminated, self._noise_hessian(views, state, values))
+        return Normal(views, state, eliminated, self._noise_hessian(views, state, eliminated, values))
 
     def locate(self, fit: Fit, covariance: Array, R: Array, low: LowBand) -> tuple[Array, Array]:
         """Find the middle of the fitted object in single frames.
@@ -281,7 +293,7 @@ class ObjectModel:
         Parameters
         ----------
         fit:
-            A motion of the G groups.
+            A motion of the G groups, fitted by this model.
         covariance:
             ``(size, 3, size, 3)`` of the coefficients of its spline.
         R:
@@ -294,9 +306,7 @@ class ObjectModel:
         place, errors:
             ``(N, 2)`` from those centres, and 1-σ errors of the way from the first frame [length].
         """
-        values = fit.spline.values(fit.low.time)
-        views = self._views(fit.path.R[-len(values) :])
-        state = self._state(views, fit.low.modes)
+        state = fit.normal.state
         moved = interpolated(low.time, fit.low.time, fit.shift)
         modes = low.modes[:, : len(self.low.k)] * np.exp(1j * moved @ self.low.k.T)
         noise = self.variance * (low.variance / self.low.variance)
@@ -310,20 +320,20 @@ class ObjectModel:
         place += np.einsum("gji,j->gi", R, self._middle(state))[:, :2]
         alone = np.diagonal(own, axis1=1, axis2=2) + np.diag(own[0])
         alone[0] = 0.0
-        common = self._common_errors(views, state, values, covariance)
+        common = self._common_errors(fit.normal, fit.spline.values(fit.low.time), covariance)
         return place, np.sqrt(alone + interpolated(low.time, fit.low.time, common) ** 2)
 
-    def _common_errors(self, views: _Views, state: _State, values: Array, covariance: Array) -> Array:
+    def _common_errors(self, normal: Normal, values: Array, covariance: Array) -> Array:
         """Return ``(G, 2)`` errors of the way from the first group that object and motion cause [length]."""
-        eliminated = self._eliminated(views, state, values)
+        views, state, eliminated = normal.views, normal.state, normal.eliminated
         middle = self._middle(state)
         arm = (self.position - middle) / state.amplitude.sum()
         lever = np.stack([np.concatenate(_folded(column)) for column in arm.T], axis=1)
         flat = covariance.reshape(2 * (3 * values.shape[1],))
         first: list[Array] = []
         errors = np.zeros((len(values), 2))
-        for part in _parts(len(values)):
-            R, column = views.R[part], self._shift_columns(views, state, part)
+        for part, column in self._columns(views, state.slopes[..., 3:]):
+            R = views.R[part]
             # the centre is the shift and the middle, which follow the object and the motion
             pulled = lever @ R[:, :, :2] - column @ eliminated.shift_covariance[part]
             turned = cross_matrix(middle @ R)[:, :2] - eliminated.carry[part].transpose(0, 2, 1)
@@ -374,8 +384,10 @@ class ObjectModel:
         cube = total.reshape(edge, edge, edge)
         cube += cube[::-1, ::-1, ::-1]
         place = 0.5 * self.spacing * np.arange(-2 * self._half, 2 * self._half + 1)
-        along = np.stack([cube * place[:, None, None], cube * place[:, None], cube * place])
-        slopes = project(views.points, along).imag.reshape(3, *self._root.shape)
+        # transforms of odd real numbers are imaginary: two fit into one
+        along = np.stack([cube * place[:, None, None] + 1j * cube * place[:, None], cube * place])
+        two, third = project(views.points, along, _FAITHFUL).reshape(2, *self._root.shape)
+        slopes = np.stack([two.imag, -two.real, third.imag])
         turned = _turning(views.R, self.low.k, slopes * self._gain**2)
         return np.asarray(turned.sum(axis=1))
 
@@ -389,7 +401,7 @@ class ObjectModel:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
         volume = np.zeros((len(amplitudes), *self._mask.shape), complex)
         volume[:, self._mask] = amplitudes
-        values = project(points, volume)
+        values = project(points, volume, _FAITHFUL)
         return np.asarray(self._blob * values.reshape(len(amplitudes), -1, len(self._blob)))
 
     def _tried(self, path: Path, shift: Array) -> _Tried:
@@ -477,45 +489,42 @@ class ObjectModel:
 
     def _eliminated(self, views: _Views, state: _State, values: Array) -> Eliminated:
         """Eliminate the object and the shifts from the normal equations of a motion."""
-        curvature = np.einsum("gki,gkj->gij", state.slopes.conj(), state.slopes, optimize=True).real
-        inverse = _shift_covariance(state.slopes[..., 3:])
-        carry = curvature[:, :3, 3:] @ inverse
-        own = curvature[:, :3, :3] - carry @ curvature[:, 3:, :3]
-        root = np.linalg.cholesky(inverse)
-        size, points = values.shape[1], len(self.position)
-        coupling = np.zeros((size, points, 3))
+        turns, shifts = state.slopes[..., :3], state.slopes[..., 3:]
+        inverse = _shift_covariance(shifts)
+        carry, alone = _without_shifts(turns, shifts, inverse)
+        every = np.concatenate([alone, shifts @ np.linalg.cholesky(inverse)], axis=-1)
+        coupling = np.zeros((values.shape[1], len(self.position), 3))
 
-        def shifts() -> Iterator[Array]:
-            for part in _parts(len(values)):
-                column = self._back_projected(views.R[part], state.slopes[part] * self._gain[part, :, None])
-                turned = column[..., :3] - column[..., 3:] @ carry[part].transpose(0, 2, 1)
-                met = np.flatnonzero(values[part].any(axis=0))
-                coupling[met] += np.tensordot(values[part][:, met], turned, (0, 0))
-                alone = column[..., 3:] @ root[part]
-                yield np.asfortranarray(alone.transpose(1, 0, 2).reshape(points, -1))
+        def parts() -> Iterator[Array]:
+            for part, column in self._columns(views, every):
+                _add_bent(coupling, values[part], column[..., :3])
+                yield np.asfortranarray(column[..., 3:].transpose(1, 0, 2).reshape(len(self.position), -1))
 
-        block = ObjectBlock(views.blocks, views.factors, shifts(), 2 * len(values))
-        flat = coupling.transpose(1, 0, 2).reshape(points, -1)
-        solution = block.solve(flat)
-        every = np.arange(len(values))
-        direct = bent_blocks(values, every, every, own)
-        return Eliminated(direct - flat.T @ solution, solution, block, inverse, carry)
+        block = ObjectBlock(views.blocks, views.factors, parts(), 2 * len(values))
+        hessian, solution = _without_object(values, alone, coupling, block)
+        return Eliminated(hessian, solution, block, inverse, carry)
 
-    def _noise_hessian(self, views: _Views, state: _State, values: Array) -> Array:
+    def _noise_hessian(self, views: _Views, state: _State, eliminated: Eliminated, values: Array) -> Array:
         """Return the ``(P, P)`` mean normal matrix of a motion of objects that are fitted to noise alone."""
         rng = np.random.default_rng(0)
-        slopes, total = state.slopes.copy(), np.zeros(2 * (3 * values.shape[1],))
+        every: list[ComplexArray] = []
         for _ in range(_PROBES):
             real, imaginary = rng.standard_normal((2, *self._root.shape))
             # a mode that stands for itself alone is real
             noise = real + 1j * (self._share > 1) * imaginary
-            _, turned = self._model(views.R, views.points, views.solve(self._right(views, noise)))
-            slopes[..., :3] = turned[..., :3] * self._root[..., None]
-            total += self._eliminated(views, replace(state, slopes=slopes), values).hessian / _PROBES
-        return total
+            _, slopes = self._model(views.R, views.points, views.solve(self._right(views, noise)))
+            turns = slopes[..., :3] * self._root[..., None]
+            every.append(_without_shifts(turns, state.slopes[..., 3:], eliminated.shift_covariance)[1])
+        alone = np.concatenate(every, axis=-1)
+        coupling = np.zeros((values.shape[1], len(self.position), alone.shape[-1]))
+        for part, column in self._columns(views, alone):
+            _add_bent(coupling, values[part], column)
+        return _without_object(values, alone, coupling, eliminated.block)[0] / _PROBES
 
-    def _shift_columns(self, views: _Views, state: _State, part: slice) -> Array:
-        return self._back_projected(views.R[part], state.slopes[part, :, 3:] * self._gain[part, :, None])
+    def _columns(self, views: _Views, whitened: ComplexArray) -> Iterator[tuple[slice, Array]]:
+        """Yield parts of the frames with the ``(g, n, C)`` products of all waves and ``(G, K, C)`` modes."""
+        for part in _parts(len(whitened)):
+            yield part, self._back_projected(views.R[part], whitened[part] * self._gain[part, :, None])
 
     def _back_projected(self, R: Array, modes: ComplexArray) -> Array:
         """Return ``(g, n, C)`` sums ``Re Σ_k exp(i⟨R k, b⟩) modes`` of ``(g, K, C)`` modes, folded."""
@@ -668,6 +677,38 @@ class _State:
     residual: ComplexArray
     slopes: ComplexArray
     cost: float
+
+
+def _without_shifts(
+    turns: ComplexArray, shifts: ComplexArray, covariance: Array
+) -> tuple[Array, ComplexArray]:
+    """Return the slopes by rotation without those by shift, after the ``(G, 3, 2)`` share of these."""
+    carry = np.einsum("gki,gkj->gij", turns.conj(), shifts).real @ covariance
+    return carry, turns - shifts @ carry.transpose(0, 2, 1)
+
+
+def _add_bent(coupling: Array, values: Array, columns: Array) -> None:
+    """Add ``(g, n, C)`` columns of frames to the spline's ``(size, n, C)``, by its ``(g, size)`` values."""
+    met = np.flatnonzero(values.any(axis=0))
+    coupling[met] += np.tensordot(values[:, met], columns, (0, 0))
+
+
+def _without_object(
+    values: Array, alone: ComplexArray, coupling: Array, block: ObjectBlock
+) -> tuple[Array, Array]:
+    """Return the ``(P, P)`` normal matrix of bending, over S objects, and how these follow, ``(n, S P)``.
+
+    From whitened slopes ``(G, K, 3 S)`` and their products with the waves, ``(size, n, 3 S)``.
+    """
+    groups, size = values.shape
+    points, objects = coupling.shape[1], coupling.shape[2] // 3
+    slopes = alone.reshape(groups, -1, 3)
+    own = np.einsum("gki,gkj->gij", slopes.conj(), slopes).real
+    flat = coupling.reshape(size, points, objects, 3).transpose(1, 2, 0, 3).reshape(points, -1)
+    solution = block.solve(flat)
+    every = np.arange(groups)
+    followed = flat.reshape(-1, 3 * size).T @ solution.reshape(-1, 3 * size)
+    return bent_blocks(values, every, every, own) - followed, solution
 
 
 def _shift_covariance(shifts: ComplexArray) -> Array:

@@ -14,7 +14,7 @@ from trapcli.motion.elimination import local_support
 from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.object_model import Assessment, Fit, ObjectModel
+from trapcli.motion.object_model import Assessment, Fit
 from trapcli.motion.translation import translation
 from trapcli.motion.types import UNKNOWN_ROTATION, ReducedMap
 from trapcli.result.motion import Flag, Motion
@@ -263,8 +263,7 @@ def _in_gauge(phi: Array) -> tuple[Array, bool]:
 def _centers(stack: Stack, fit: Fit, assessment: Assessment) -> tuple[Array, Array]:
     """Return the centres C₂, where the object model is in each frame, and the errors of T."""
     used = np.flatnonzero(stack.seen & ~stack.outlying)
-    model = ObjectModel.after(fit, assessment, float(np.linalg.norm(fit.low.k, axis=1).max()))
-    own, errors = model.locate(fit, assessment.covariance, fit.path.R[used], stack.low.select(used))
+    own, errors = fit.model.locate(fit, assessment.covariance, fit.path.R[used], stack.low.select(used))
     time = stack.low.time
     place, errors = (interpolated(time, time[used], series) for series in (own, errors))
     return stack.centers.center + place, errors
