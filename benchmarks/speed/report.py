@@ -80,8 +80,8 @@ def write_page(results: dict[str, Any], path: Path) -> None:
         "",
         "The paper as written (`benchmarks/speed/literal.py`) finds T, φ, ω₃, α and R too: double precision,",
         "Φ for every direction, both equations of the paper with differences of neighbouring frames. Without",
-        "noise it finds them (`tests/benchmarks/test_literal.py`: α within 3 %); with the noise of these frames",
-        "its rates are of no use, and only its time counts. It is timed on the first frames, and takes",
+        "noise it finds them (`tests/benchmarks/test_literal.py`: α within 3 %); with the noise of these",
+        "frames its rates are of no use, only its time counts. It is timed on the first frames, and takes",
         f"{_least(one['literal'], 'seconds') / _least(one['estimate'], 'seconds'):.1f} times as long as "
         "`trap-motion estimate` for each",
         "of them (aim: 15).",
