@@ -59,7 +59,7 @@ def main() -> None:
     elif options.what == "front-end":
         front_end(frames, options.background)
     else:
-        Literal(frames, options.threads).rates()
+        Literal(frames, options.threads).motion()
     print((clock.perf_counter() - start) / len(frames))
 
 
