@@ -68,7 +68,10 @@ class Evidence:
         return self._judged(_together([path]))[0]
 
     def refine(self, paths: list[Path], spline: Spline, steps: int) -> list[Hypothesis]:
-        """Bend paths to local minima (Levenberg–Marquardt in the spline's coefficients), each on its own."""
+        """Bend paths to local minima (Levenberg–Marquardt in the spline's coefficients).
+
+        Each goes its own way; they share the overhead of small arrays.
+        """
         values = spline.values(self.time)
         count, size = len(paths), 3 * spline.size
         best = _together(paths)
@@ -86,14 +89,15 @@ class Evidence:
                 tried = Path(self.time, best.R[waiting], best.omega[waiting]).bent(spline, step)
                 tried_cost = self._cost(tried.R)
                 better = tried_cost < cost[waiting]
-                at = waiting[better]
-                best.R[at], best.omega[at] = tried.R[better], tried.omega[better]
-                cost[at] = tried_cost[better]
+                accepted = waiting[better]
+                best.R[accepted], best.omega[accepted] = tried.R[better], tried.omega[better]
+                cost[accepted] = tried_cost[better]
                 waiting = waiting[~better]
                 damping[waiting] *= 8
                 if not len(waiting):
                     break
             damping[moving] = np.maximum(damping[moving] / 5, 1e-7)
+            # a path that gained little, or nothing in all trials, has come to rest
             moving = moving[(before - cost)[moving] > 2e-3 * cost[moving]]
             if not len(moving):
                 break
