@@ -77,7 +77,7 @@ class LineTable:
         right, slope_right = np.roll(left, -1, axis=1), np.roll(slope_left, -1, axis=1)
         square = 3 * (right - left) - 2 * slope_left - slope_right
         cube = 2 * (left - right) + slope_left + slope_right
-        self._cubics = np.stack([left, slope_left, square, cube], axis=2).astype(np.float32)
+        self._cubics = np.stack([left, slope_left, square, cube], axis=2)
         power = np.mean(np.abs(samples) ** 2, axis=(0, 2))
         share = min(1.0, float(reduced.mu[1] - reduced.mu[0]) * reduced.radius / np.pi)
         self._weights = np.tile(share / (reduced.noise**2 + model_error**2 * power), 2)
@@ -149,9 +149,9 @@ class LineTable:
         return (x - line).astype(np.float32)[..., None], self._cubics[frame, line % count]
 
 
-def _parts(table: NDArray[np.complex128]) -> Array:
+def _parts(table: NDArray[np.complex128]) -> Samples:
     """Return real and imaginary parts of J̃, ``(G, angles, 2M)``."""
-    return np.concatenate([table.real, table.imag], axis=1).transpose(0, 2, 1)
+    return np.concatenate([table.real, table.imag], axis=1, dtype=np.float32).transpose(0, 2, 1)
 
 
 def _value(u: Samples, cubic: Samples) -> Samples:
