@@ -96,7 +96,7 @@ def test_the_gradient_is_half_the_slope_downhill(tumbling: Scene) -> None:
     evidence, spline = tumbling.evidence, Spline(0.0, 1.0, 3)
     rng = np.random.default_rng(0)
     path = tumbling.path.bent(spline, 0.02 * rng.normal(size=(spline.size, 3)))
-    hessian, gradient = evidence._normal_equations(path, spline.values(path.time))
+    hessian, gradient = evidence._normal_equations(path.R, spline.values(path.time))
     assert hessian == pytest.approx(hessian.T, abs=1e-6 * np.abs(hessian).max())
     h = 1e-3
     for i in range(3 * spline.size):
@@ -110,13 +110,30 @@ def test_refining_never_goes_uphill_and_comes_home(tumbling: Scene) -> None:
     evidence, spline = tumbling.evidence, Spline(0.0, 1.0, 5)
     path = tumbling.path.bent(spline, 0.1 * np.random.default_rng(2).normal(size=(spline.size, 3)))
     start = evidence.judge(path)
-    costs = [evidence.refine(path, spline, steps).cost for steps in (0, 1, 2, 4, 12)]
+    costs = [evidence.refine([path], spline, steps)[0].cost for steps in (0, 1, 2, 4, 12)]
     assert costs[0] == start.cost
     assert (np.diff(costs) <= 0).all()
-    found = evidence.refine(path, spline, 20)
+    (found,) = evidence.refine([path], spline, 20)
     assert off(path, tumbling.path) > 3
     assert off(found.path, tumbling.path) < 1
     assert found.cost < evidence.judge(tumbling.path).cost
+
+
+def test_paths_refined_at_once_are_those_refined_alone(tumbling: Scene) -> None:
+    """They need different numbers of steps and of trials, and one is where it ends already."""
+    evidence, spline = tumbling.evidence, Spline(0.0, 1.0, 3)
+    rng = np.random.default_rng(5)
+    bends = [size * rng.normal(size=(spline.size, 3)) for size in (0.02, 0.1, 0.3, 1.0)]
+    paths = [tumbling.path.bent(spline, bend) for bend in bends]
+    paths += [Path.constant(tumbling.path.time, omega) for omega in 4 * rng.normal(size=(3, 3))]
+    paths += [evidence.refine(paths[:1], spline, 30)[0].path]
+    together = evidence.refine(paths, spline, 6)
+    assert len({round(h.cost) for h in together}) > 4
+    for path, found in zip(paths, together, strict=True):
+        (alone,) = evidence.refine([path], spline, 6)
+        assert found.cost == pytest.approx(alone.cost, rel=1e-12)
+        assert pytest.approx(alone.path.R, abs=1e-9) == found.path.R
+        assert evidence.judge(found.path).cost == pytest.approx(found.cost, rel=1e-12)
 
 
 def test_selection_is_evidence_of_fewer_groups(tumbling: Scene) -> None:

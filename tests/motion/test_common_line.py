@@ -62,8 +62,9 @@ def test_the_map_agrees_along_the_common_line(blobs: Blobs, peak: float) -> None
     s, t = np.arange(30), np.arange(30, 60)
     mu = np.linspace(-3, 3, 25)
     Q = np.swapaxes(R[s], 1, 2) @ R[t]
-    _, _, angle_s, angle_t, found_Q = _geometry(R, s, t)
-    assert found_Q == pytest.approx(Q, abs=1e-15)
+    q, p, (angle_s, angle_t) = _geometry(R, s, t)
+    assert q == pytest.approx(Q[:, :, 2], abs=1e-15)
+    assert p == pytest.approx(Q[:, 2, :], abs=1e-15)
     assert angle_s == pytest.approx(np.arctan2(Q[:, 0, 2], -Q[:, 1, 2]))
     assert angle_t == pytest.approx(np.arctan2(-Q[:, 2, 0], Q[:, 2, 1]))
     for i in range(30):
@@ -83,7 +84,7 @@ def test_interpolation(blobs: Blobs, R: Array, peak: float) -> None:
         np.array([blobs.fourier(along(a + d, reduced.mu), R[f]) for f, a in zip(frame, angle, strict=True)])
         for d in (-h, h)
     )
-    values, slopes = table._interpolate(frame, angle)
+    values, slopes = (x[:, :RINGS] + 1j * x[:, RINGS:] for x in table._interpolate(frame, angle))
     assert np.abs(values - exact).max() < 1e-5 * peak
     assert np.abs(slopes - (after - before) / (2 * h)).max() < 1e-3 * peak
 
@@ -144,6 +145,18 @@ def test_hessians_are_symmetric_and_not_negative(blobs: Blobs, R: Array, pairs: 
     assert hessian == pytest.approx(np.swapaxes(hessian, 1, 2), rel=1e-6)
     values = np.linalg.eigvalsh(hessian)
     assert (values > -1e-6 * values.max()).all()
+
+
+def test_several_paths_at_once(blobs: Blobs, R: Array, pairs: Pairs, peak: float) -> None:
+    table = LineTable(exact_map(blobs, R, 0.01 * peak), 0.01)
+    several = np.stack([R, random_rotations(FRAMES, 4)])
+    found = table.residuals(several, *pairs)
+    assert found.cost == pytest.approx(table.cost(several, *pairs))
+    for i, one in enumerate(several):
+        alone = table.residuals(one, *pairs)
+        assert found.cost[i] == pytest.approx(alone.cost)
+        assert found.gradient[i] == pytest.approx(alone.gradient)
+        assert found.hessian[i] == pytest.approx(alone.hessian)
 
 
 def test_equal_views_say_nothing(blobs: Blobs, R: Array, peak: float) -> None:

@@ -71,11 +71,13 @@ def test_tensors_turn_with_the_frame(R: Array, rng: np.random.Generator, order: 
     table = _Order.create(order, np.zeros((FRAMES, components)), np.eye(components), 0.0)
     assert len(table.basis) == {2: 6, 3: 10}[order]
     coefficients = rng.normal(size=len(table.basis))
-    tensor = np.tensordot(coefficients, table.basis, 1)
-    lab = table.lab(R)
-    assert lab.shape == (FRAMES, len(table.basis), *(3,) * order)
-    found = table.design(lab) @ coefficients
+    tensor = (coefficients @ table.basis).reshape((3,) * order)
+    found = table.design(R) @ coefficients
     assert found == pytest.approx(seen(tensor, R, order), abs=1e-13)
+    lab = table.lab(R, coefficients).reshape(FRAMES, *(3,) * order)
+    assert lab[:, *table.components.T] == pytest.approx(found, abs=1e-13)
+    assert lab == pytest.approx(np.swapaxes(lab, 1, -1), abs=1e-13)
+    assert np.sum(lab**2, axis=tuple(range(1, order + 1))) == pytest.approx(np.sum(tensor**2))
 
 
 @pytest.mark.parametrize("model_error", [0.0, 0.01])
@@ -141,6 +143,18 @@ def test_one_axis_in_the_image_is_seen(rng: np.random.Generator) -> None:
     table = MomentTable(low_band(R, rng), 0.0)
     faster = np.asarray(Rotation.from_rotvec(1.05 * angle * [0.8, 0.6, 0]).as_matrix())
     assert table.cost(faster) > 100 > 1e3 * table.cost(R)
+
+
+def test_several_paths_at_once(R: Array, rng: np.random.Generator) -> None:
+    table = MomentTable(low_band(R, rng, noise=1.0), 0.01)
+    several = np.stack([bent(R, rng.normal(scale=size, size=(FRAMES, 3))) for size in (0.0, 0.1, 1.0)])
+    assert table.cost(several) == pytest.approx(np.array([table.cost(one) for one in several]))
+    for order, found in enumerate(table.residuals(several)):
+        for i, one in enumerate(several):
+            alone = table.residuals(one)[order]
+            assert found.gradient[i] == pytest.approx(alone.gradient, abs=1e-9 * np.abs(alone.gradient).max())
+            assert found.slopes[i] == pytest.approx(alone.slopes, abs=1e-9 * np.abs(alone.slopes).max())
+            assert found.normal[i] == pytest.approx(alone.normal)
 
 
 def test_selection(R: Array, rng: np.random.Generator) -> None:

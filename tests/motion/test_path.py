@@ -74,6 +74,18 @@ def test_a_bent_path_keeps_R_and_omega_together(
     assert bent.omega[here] == pytest.approx(numerical, abs=1e-8 * np.abs(numerical).max())
 
 
+def test_several_paths_are_bent_at_once(two_turns: Any, rng: np.random.Generator) -> None:
+    time, spline = np.linspace(0, 1, 20), Spline(0.0, 1.0, 4)
+    paths = [Path(time, two_turns.rotations(t), two_turns.omega(t)) for t in (time, time + 0.3)]
+    coefficients = rng.normal(size=(2, spline.size, 3))
+    together = Path(time, np.stack([p.R for p in paths]), np.stack([p.omega for p in paths]))
+    bent = together.bent(spline, coefficients)
+    for i, path in enumerate(paths):
+        alone = path.bent(spline, coefficients[i])
+        assert pytest.approx(alone.R, abs=1e-14) == bent.R[i]
+        assert bent.omega[i] == pytest.approx(alone.omega, abs=1e-12)
+
+
 def test_no_bend_changes_nothing(two_turns: Any) -> None:
     time = np.linspace(0, 1, 20)
     path = Path(time, two_turns.rotations(time), two_turns.omega(time))

@@ -65,65 +65,86 @@ class Evidence:
 
     def judge(self, path: Path) -> Hypothesis:
         """Return the path with its cost."""
-        s, t = self.pairs
-        lines, moments = self.lines.cost(path.R, s, t).sum(), self.moments.cost(path.R)
-        per_pair = lines / (len(s) * self.lines.degrees)
-        degrees = max(7 * len(self.time) - 16, 1)
-        return Hypothesis(path, self._scale(len(s)) * lines + moments, float(per_pair), moments / degrees)
+        return self._judged(_together([path]))[0]
 
-    def refine(self, path: Path, spline: Spline, steps: int) -> Hypothesis:
-        """Bend a path to a local minimum (Levenberg–Marquardt in the spline's coefficients)."""
+    def refine(self, paths: list[Path], spline: Spline, steps: int) -> list[Hypothesis]:
+        """Bend paths to local minima (Levenberg–Marquardt in the spline's coefficients).
+
+        Each goes its own way; they share the overhead of small arrays.
+        """
         values = spline.values(self.time)
-        damping = 1e-2
-        best = self.judge(path)
+        count, size = len(paths), 3 * spline.size
+        best = _together(paths)
+        cost = self._cost(best.R)
+        hessian, gradient = np.zeros((count, size, size)), np.zeros((count, size))
+        damping = np.full(count, 1e-2)
+        moving = np.arange(count)
         for _ in range(steps):
-            hessian, gradient = self._normal_equations(best.path, values)
-            diagonal = np.diag(hessian)
+            hessian[moving], gradient[moving] = self._normal_equations(best.R[moving], values)
+            before, waiting = cost.copy(), moving
             for _ in range(5):
-                damped = hessian + np.diag(damping * diagonal + 1e-6 * diagonal.mean() + 1e-300)
-                step = np.linalg.solve(damped, gradient).reshape(-1, 3)
-                largest = np.linalg.norm(values @ step, axis=1).max()
-                tried = self.judge(
-                    best.path.bent(spline, step * min(1.0, _LARGEST_STEP / max(largest, 1e-300)))
-                )
-                if tried.cost < best.cost:
+                step = _damped_step(hessian[waiting], gradient[waiting], damping[waiting])
+                largest = np.linalg.norm(values @ step, axis=-1).max(axis=-1)
+                step *= np.minimum(1.0, _LARGEST_STEP / np.maximum(largest, 1e-300))[:, None, None]
+                tried = Path(self.time, best.R[waiting], best.omega[waiting]).bent(spline, step)
+                tried_cost = self._cost(tried.R)
+                better = tried_cost < cost[waiting]
+                accepted = waiting[better]
+                best.R[accepted], best.omega[accepted] = tried.R[better], tried.omega[better]
+                cost[accepted] = tried_cost[better]
+                waiting = waiting[~better]
+                damping[waiting] *= 8
+                if not len(waiting):
                     break
-                damping *= 8
-            else:
-                return best
-            gain, best = best.cost - tried.cost, tried
-            damping = max(damping / 5, 1e-7)
-            if gain < 2e-3 * best.cost:
+            damping[moving] = np.maximum(damping[moving] / 5, 1e-7)
+            # a path that gained little, or nothing in all trials, has come to rest
+            moving = moving[(before - cost)[moving] > 2e-3 * cost[moving]]
+            if not len(moving):
                 break
-        return best
+        return self._judged(best)
 
-    def _scale(self, pairs: int) -> float:
-        """Return what one pair counts: a frame has few independent lines, however many pairs share them."""
-        return min(1.0, 0.5 * self.lines.reach * len(self.time) / pairs)
+    def _misfits(self, R: Array) -> tuple[Array, Array]:
+        """Return the misfits of lines and of moments."""
+        return self.lines.cost(R, *self.pairs).sum(axis=-1), self.moments.cost(R)
 
-    def _normal_equations(self, path: Path, values: Array) -> tuple[Array, Array]:
-        """Return Hessian and downhill gradient by the spline's coefficients."""
+    def _cost(self, R: Array) -> Array:
+        lines, moments = self._misfits(R)
+        return self._scale * lines + moments
+
+    def _judged(self, paths: Path) -> list[Hypothesis]:
+        """Return each of several paths with its cost."""
+        lines, moments = self._misfits(paths.R)
+        cost = self._scale * lines + moments
+        lines /= len(self.pairs[0]) * self.lines.degrees
+        moments /= max(7 * len(self.time) - 16, 1)
+        each = zip(paths.R, paths.omega, np.stack([cost, lines, moments], axis=-1).tolist(), strict=True)
+        return [Hypothesis(Path(self.time, R, omega), *judged) for R, omega, judged in each]
+
+    @property
+    def _scale(self) -> float:
+        """What one pair counts: a frame has few independent lines, however many pairs share them."""
+        return min(1.0, 0.5 * self.lines.reach * len(self.time) / len(self.pairs[0]))
+
+    def _normal_equations(self, R: Array, values: Array) -> tuple[Array, Array]:
+        """Return Hessians and downhill gradients by the spline's coefficients."""
         s, t = self.pairs
-        lines = self.lines.residuals(path.R, s, t)
-        scale = self._scale(len(s))
-        groups, size = values.shape
-        own = np.zeros((groups, 3, 3))
-        np.add.at(own, s, scale * lines.hessian[:, :3, :3])
-        np.add.at(own, t, scale * lines.hessian[:, 3:, 3:])
-        gradient = np.zeros((groups, 3))
-        np.add.at(gradient, s, scale * lines.gradient[:, :3])
-        np.add.at(gradient, t, scale * lines.gradient[:, 3:])
-        eliminated = np.zeros((3 * size, 3 * size))
-        for order in self.moments.residuals(path.R):
-            gradient += order.gradient
-            own += np.swapaxes(order.slopes, 1, 2) @ order.slopes
-            coupling = np.swapaxes(order.design, 1, 2) @ order.slopes
-            bent = np.einsum("gb,gui->ubi", values, coupling, optimize=True).reshape(-1, 3 * size)
-            eliminated += bent.T @ np.linalg.solve(order.normal, bent)
-        every = np.arange(groups)
-        across = bent_blocks(values, s, t, scale * lines.hessian[:, :3, 3:])
-        hessian = bent_blocks(values, every, every, own) + across + across.T - eliminated
-        return hessian, (values.T @ gradient).ravel()
+        lines = self.lines.residuals(R, s, t)
+        across = bent_blocks(values, s, t, lines.hessian[..., :3, 3:])
+        hessian = across + np.swapaxes(across, -1, -2)
+        hessian += bent_blocks(values, s, s, lines.hessian[..., :3, :3])
+        hessian += bent_blocks(values, t, t, lines.hessian[..., 3:, 3:])
+        hessian *= self._scale
+        gradient = values[s].T @ lines.gradient[..., :3] + values[t].T @ lines.gradient[..., 3:]
+        gradient *= self._scale
+        every = np.arange(len(self.time))
+        for order in self.moments.residuals(R):
+            gradient += values.T @ order.gradient
+            hessian += bent_blocks(values, every, every, np.swapaxes(order.slopes, -1, -2) @ order.slopes)
+            coupling = np.swapaxes(order.design, -1, -2) @ order.slopes
+            bent = np.einsum("gb,...gui->...ubi", values, coupling, optimize=True)
+            bent = bent.reshape(*bent.shape[:-2], -1)
+            hessian -= np.swapaxes(bent, -1, -2) @ np.linalg.solve(order.normal, bent)
+        return hessian, gradient.reshape(*gradient.shape[:-2], -1)
 
 
 def find_branches(
@@ -173,7 +194,7 @@ def find_branches(
         for h in hypotheses:
             path = h.path.extended(wider.time, low - new_low, tail)
             if whole:
-                grown.append(wider.refine(path, _spline(wider.time, groups_per_knot), 12))
+                grown += wider.refine([path], _spline(wider.time, groups_per_knot), 12)
             else:
                 grown.append(wider.judge(_refine_ends(wider, path, groups_per_knot)))
         hypotheses = _distinct(grown, keep)
@@ -194,7 +215,7 @@ def _refine_ends(evidence: Evidence, path: Path, groups_per_knot: int) -> Path:
     for window, joint in ((slice(0, size), size - 1), (slice(groups - size, groups), 0)):
         end = evidence.select(window.start, window.stop)
         piece = Path(path.time[window], path.R[window], path.omega[window])
-        bent = end.refine(piece, _spline(end.time, groups_per_knot), 8).path
+        bent = end.refine([piece], _spline(end.time, groups_per_knot), 8)[0].path
         R, omega = path.R.copy(), path.omega.copy()
         # the object's orientation is free in each refinement: join where the window meets the rest
         R[window] = orthonormal((path.R[window][joint] @ bent.R[joint].T) @ bent.R)
@@ -209,13 +230,27 @@ def _first_window(evidence: Evidence, starts: int, keep: int) -> list[Hypothesis
     span = time[-1] - time[0]
     # constant angular velocity: a rotation that grows linearly is all that bends at first
     line, curve = Spline(time[0], time[-1], 1), Spline(time[0], time[-1], 2)
-    found = []
+    paths = []
     for _ in range(starts):
         axis = rng.normal(size=3)
         omega = axis / np.linalg.norm(axis) * rng.uniform(_SLOWEST, _FASTEST) / span
-        rough = evidence.refine(Path.constant(time, omega), line, 8)
-        found.append(evidence.refine(rough.path, curve, 8))
-    return _distinct(found, keep)
+        paths.append(Path.constant(time, omega))
+    rough = evidence.refine(paths, line, 8)
+    return _distinct(evidence.refine([h.path for h in rough], curve, 8), keep)
+
+
+def _together(paths: list[Path]) -> Path:
+    """Return paths at the same times on a leading axis."""
+    return Path(paths[0].time, np.stack([p.R for p in paths]), np.stack([p.omega for p in paths]))
+
+
+def _damped_step(hessian: Array, gradient: Array, damping: Array) -> Array:
+    """Return ``(..., size, 3)`` coefficients of the damped step downhill."""
+    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    ridge = damping[..., None] * diagonal + 1e-6 * diagonal.mean(axis=-1, keepdims=True) + 1e-300
+    damped = hessian + ridge[..., None] * np.eye(diagonal.shape[-1])
+    step = np.linalg.solve(damped, gradient[..., None])
+    return np.asarray(step.reshape(*gradient.shape[:-1], -1, 3))
 
 
 def _distinct(hypotheses: list[Hypothesis], keep: int) -> list[Hypothesis]:

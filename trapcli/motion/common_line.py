@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trapcli.motion.path import cross_matrix
 from trapcli.motion.types import ReducedMap
 
 Array = NDArray[np.float64]
+Samples = NDArray[np.float32]
 Index = NDArray[np.intp]
 
-_E3 = cross_matrix(np.array([0.0, 0.0, 1.0]))
 _FINEST_ANGLES = 128  # least samples over the whole turn for cubic interpolation
 _SHORT_BASELINE = (
     0.02  # sin² of the angle between viewing directions below which a common line is ill-determined
@@ -32,13 +31,14 @@ class LineResiduals:
     Attributes
     ----------
     cost:
-        ``(P,)`` robust misfit; `degrees` is expected.
+        ``(..., P)`` robust misfit; `degrees` is expected.
     degrees:
         Degrees of freedom of a pair.
     gradient:
-        ``(P, 6)`` half the negative gradient by small rotations ε of frames s and t, ``R → R exp([ε]×)``.
+        ``(..., P, 6)`` half the negative gradient by small rotations ε of frames s and t,
+        ``R → R exp([ε]×)``.
     hessian:
-        ``(P, 6, 6)`` half the Gauss–Newton Hessian.
+        ``(..., P, 6, 6)`` half the Gauss–Newton Hessian.
     """
 
     cost: Array
@@ -48,7 +48,9 @@ class LineResiduals:
 
 
 class LineTable:
-    """J̃ and ∂φJ̃ of G frames (or groups of frames) along all lines, ready for interpolation.
+    """J̃ of G frames (or groups of frames) along all lines, cubic between them (Hermite).
+
+    Real parts come first, then the imaginary ones.
 
     Parameters
     ----------
@@ -69,37 +71,37 @@ class LineTable:
         full = np.zeros((groups, rings, fine), complex)
         full[:, :, order] = spectrum
         wave = np.fft.fftfreq(fine, 1 / fine)
-        self._values = self._layout(np.fft.ifft(full, axis=2) * fine)
-        self._slopes = self._layout(np.fft.ifft(full * (1j * wave), axis=2) * fine)
-        self._angles = fine
+        step = 2 * np.pi / fine
+        left = _parts(np.fft.ifft(full, axis=2) * fine)
+        slope_left = _parts(np.fft.ifft(full * (1j * wave), axis=2) * (fine * step))
+        right, slope_right = np.roll(left, -1, axis=1), np.roll(slope_left, -1, axis=1)
+        square = 3 * (right - left) - 2 * slope_left - slope_right
+        cube = 2 * (left - right) + slope_left + slope_right
+        self._cubics = np.stack([left, slope_left, square, cube], axis=2)
         power = np.mean(np.abs(samples) ** 2, axis=(0, 2))
         share = min(1.0, float(reduced.mu[1] - reduced.mu[0]) * reduced.radius / np.pi)
-        self._weights = share / (reduced.noise**2 + model_error**2 * power)
+        self._weights = np.tile(share / (reduced.noise**2 + model_error**2 * power), 2)
         self.degrees = 2.0 * rings * share
         """Degrees of freedom of a pair of frames."""
         self.reach = float(reduced.mu[-1] * reduced.radius)
         """Highest frequency times radius: about the number of independent lines of a frame."""
 
     def __len__(self) -> int:
-        return len(self._values)
-
-    @staticmethod
-    def _layout(table: NDArray[np.complex128]) -> NDArray[np.complex64]:
-        return np.ascontiguousarray(table.transpose(0, 2, 1)).astype(np.complex64)
+        return len(self._cubics)
 
     def select(self, start: int, stop: int) -> LineTable:
         """Return the table of consecutive frames."""
         part = object.__new__(LineTable)
         part.__dict__.update(self.__dict__)
-        part._values, part._slopes = self._values[start:stop], self._slopes[start:stop]
+        part._cubics = self._cubics[start:stop]
         return part
 
     def cost(self, R: Array, s: Index, t: Index) -> Array:
-        """Return the ``(P,)`` robust misfits of pairs of frames."""
-        q, _, angle_s, angle_t, _ = _geometry(R, s, t)
-        value_s, _ = self._interpolate(s, angle_s)
-        value_t, _ = self._interpolate(t, angle_t)
-        return self._robust(np.abs(value_s - value_t) ** 2 @ self._weights, _sin2(q))[0]
+        """Return the ``(..., P)`` robust misfits of pairs of frames."""
+        q, _, angles = _geometry(R, s, t)
+        values = _value(*self._cubic(np.stack([s, t]), angles))
+        difference = values[..., 0, :, :] - values[..., 1, :, :]
+        return self._robust(difference**2 @ self._weights, _sin2(q))[0]
 
     def residuals(self, R: Array, s: Index, t: Index) -> LineResiduals:
         """Return the misfits of pairs of frames with their derivatives.
@@ -107,29 +109,23 @@ class LineTable:
         Parameters
         ----------
         R:
-            ``(G, 3, 3)`` rotations.
+            ``(..., G, 3, 3)`` rotations.
         s, t:
             ``(P,)`` frames of each pair.
         """
-        q, p, angle_s, angle_t, Q = _geometry(R, s, t)
-        value_s, slope_s = self._interpolate(s, angle_s)
-        value_t, slope_t = self._interpolate(t, angle_t)
-        difference = value_s - value_t
-        sin2 = _sin2(q)
-        cost, weight = self._robust(np.abs(difference) ** 2 @ self._weights, sin2)
-        turn_s, turn_t = _angle_derivatives(q, p, Q, sin2)
-        ss = weight * (np.abs(slope_s) ** 2 @ self._weights)
-        tt = weight * (np.abs(slope_t) ** 2 @ self._weights)
-        st = weight * ((slope_s.conj() * slope_t).real @ self._weights)
-        cross = turn_s[:, :, None] * turn_t[:, None]
-        hessian = (
-            ss[:, None, None] * turn_s[:, :, None] * turn_s[:, None]
-            + tt[:, None, None] * turn_t[:, :, None] * turn_t[:, None]
-            - st[:, None, None] * (cross + cross.transpose(0, 2, 1))
+        q, p, angles = _geometry(R, s, t)
+        values, slopes = self._interpolate(np.stack([s, t]), angles)
+        difference = values[..., 0, :, :] - values[..., 1, :, :]
+        by_s, by_t = slopes[..., 0, :, :], -slopes[..., 1, :, :]
+        cost, weight = self._robust(difference**2 @ self._weights, _sin2(q))
+        ss, st, tt, s_down, t_down = (
+            weight * (a * b @ self._weights)
+            for a, b in [(by_s, by_s), (by_s, by_t), (by_t, by_t), (by_s, difference), (by_t, difference)]
         )
-        down_s = weight * ((slope_s.conj() * difference).real @ self._weights)
-        down_t = weight * ((slope_t.conj() * difference).real @ self._weights)
-        gradient = -(down_s[:, None] * turn_s - down_t[:, None] * turn_t)
+        turns = _angle_derivatives(q, p)
+        curvature = np.stack([ss, st, st, tt], axis=-1).reshape(*ss.shape, 2, 2)
+        hessian = np.swapaxes(turns, -1, -2) @ (curvature @ turns)
+        gradient = -(s_down[..., None] * turns[..., 0, :] + t_down[..., None] * turns[..., 1, :])
         return LineResiduals(cost, self.degrees, gradient, hessian)
 
     def _robust(self, misfit: Array, sin2: Array) -> tuple[Array, Array]:
@@ -140,22 +136,32 @@ class LineTable:
         cost = trusted * scale * np.log1p(misfit / scale) + (1 - trusted) * self.degrees
         return cost, trusted / (1 + misfit / scale)
 
-    def _interpolate(
-        self, frame: Index, angle: Array
-    ) -> tuple[NDArray[np.complexfloating], NDArray[np.complexfloating]]:
-        """Return cubic Hermite interpolants of J̃ and their slopes, ``(P, M)``."""
-        x = np.mod(angle, 2 * np.pi) * (self._angles / (2 * np.pi))
-        left = np.floor(x).astype(np.intp)
-        u = (x - left).astype(np.float32)[:, None]
-        left %= self._angles
-        right = (left + 1) % self._angles
-        h = np.float32(2 * np.pi / self._angles)
-        a, b = self._values[frame, left], self._values[frame, right]
-        da, db = self._slopes[frame, left] * h, self._slopes[frame, right] * h
-        w = 1 - u
-        value = a * ((1 + 2 * u) * w * w) + da * (u * w * w) + b * (u * u * (3 - 2 * u)) - db * (u * u * w)
-        slope = ((6 * u * w) * (b - a) + da * (w * (1 - 3 * u)) + db * (u * (3 * u - 2))) / h
-        return value, slope
+    def _interpolate(self, frame: Index, angle: Array) -> tuple[Samples, Samples]:
+        """Return interpolants of J̃ and their slopes, ``(..., 2M)``."""
+        cubic = self._cubic(frame, angle)
+        return _value(*cubic), _slope(*cubic) * np.float32(self._cubics.shape[1] / (2 * np.pi))
+
+    def _cubic(self, frame: Index, angle: Array) -> tuple[Samples, Samples]:
+        """Return where between two lines angles lie, ``(..., 1)``, and the cubics there, ``(..., 4, 2M)``."""
+        count = self._cubics.shape[1]
+        x = np.mod(angle, 2 * np.pi) * (count / (2 * np.pi))
+        line = np.floor(x).astype(np.intp)
+        return (x - line).astype(np.float32)[..., None], self._cubics[frame, line % count]
+
+
+def _parts(table: NDArray[np.complex128]) -> Samples:
+    """Return real and imaginary parts of J̃, ``(G, angles, 2M)``."""
+    return np.concatenate([table.real, table.imag], axis=1, dtype=np.float32).transpose(0, 2, 1)
+
+
+def _value(u: Samples, cubic: Samples) -> Samples:
+    a, b, c, d = np.moveaxis(cubic, -2, 0)
+    return np.asarray(a + u * (b + u * (c + u * d)))
+
+
+def _slope(u: Samples, cubic: Samples) -> Samples:
+    _, b, c, d = np.moveaxis(cubic, -2, 0)
+    return np.asarray(b + u * (2 * c + 3 * u * d))
 
 
 def choose_pairs(groups: int, per_group: int, seed: int) -> tuple[Index, Index]:
@@ -170,31 +176,29 @@ def choose_pairs(groups: int, per_group: int, seed: int) -> tuple[Index, Index]:
     return pairs[0], pairs[1]
 
 
-def _geometry(R: Array, s: Index, t: Index) -> tuple[Array, Array, Array, Array, Array]:
-    """Return Q e₃, Qᵀ e₃, the angles of the common line in both frames, and Q."""
-    Q = np.swapaxes(R[s], 1, 2) @ R[t]
-    q, p = Q[:, :, 2], Q[:, 2, :]
-    return q, p, np.arctan2(q[:, 0], -q[:, 1]), np.arctan2(-p[:, 0], p[:, 1]), Q
+def _geometry(R: Array, s: Index, t: Index) -> tuple[Array, Array, Array]:
+    """Return q = Q e₃, p = Qᵀ e₃ and the ``(..., 2, P)`` angles of the common line in both frames."""
+    first, second = R[..., s, :, :], R[..., t, :, :]
+    q = np.einsum("...ki,...k->...i", first, second[..., 2])
+    p = np.einsum("...ki,...k->...i", second, first[..., 2])
+    angles = np.arctan2([q[..., 0], -p[..., 0]], [-q[..., 1], p[..., 1]])
+    return q, p, np.moveaxis(angles, 0, -2)
 
 
 def _sin2(q: Array) -> Array:
-    return np.asarray(np.maximum(q[:, 0] ** 2 + q[:, 1] ** 2, 1e-4))
+    return np.asarray(np.maximum(q[..., 0] ** 2 + q[..., 1] ** 2, 1e-4))
 
 
-def _angle_derivatives(q: Array, p: Array, Q: Array, sin2: Array) -> tuple[Array, Array]:
-    """Return ``(P, 6)`` derivatives of the two angles by ε_s and ε_t.
+def _angle_derivatives(q: Array, p: Array) -> Array:
+    """Return ``(..., P, 2, 6)`` derivatives of the two angles by ε_s and ε_t.
 
-    ``dq = [q]× ε_s − Q [e₃]× ε_t`` and ``dp = [p]× ε_t − Qᵀ [e₃]× ε_s``.
+    From ``dq = [q]× ε_s − Q [e₃]× ε_t`` and ``dp = [p]× ε_t − Qᵀ [e₃]× ε_s``; q₃ = p₃ = Q₃₃.
     """
-    zero = np.zeros(len(q))
-    along_q = np.stack([-q[:, 1], q[:, 0], zero], axis=1) / sin2[:, None]
-    along_p = np.stack([-p[:, 1], p[:, 0], zero], axis=1) / sin2[:, None]
-
-    def row(vector: Array, matrix: Array) -> Array:
-        return np.asarray(np.einsum("pi,pij->pj", vector, matrix))
-
-    angle_s = np.concatenate([row(along_q, cross_matrix(q)), -row(along_q, Q @ _E3)], axis=1)
-    angle_t = np.concatenate(
-        [-row(along_p, np.swapaxes(Q, 1, 2) @ _E3), row(along_p, cross_matrix(p))], axis=1
-    )
-    return angle_s, angle_t
+    turns = np.zeros((*q.shape[:-1], 2, 2, 3))
+    turns[..., 0, 0, :2] = q[..., :2] * q[..., 2:]
+    turns[..., 0, 1, :2] = p[..., :2]
+    turns[..., 1, 0, :2] = q[..., :2]
+    turns[..., 1, 1, :2] = p[..., :2] * p[..., 2:]
+    turns[..., 0, 0, 2] = turns[..., 1, 1, 2] = -np.sum(q[..., :2] ** 2, axis=-1)
+    turns /= _sin2(q)[..., None, None, None]
+    return turns.reshape(*q.shape[:-1], 2, 6)

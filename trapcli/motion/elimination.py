@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse
 from numpy.typing import NDArray
 
 from trapcli.motion.threads import in_parallel
@@ -112,12 +113,17 @@ def local_support(values: Array) -> tuple[Indices, Array]:
 
 
 def bent_blocks(values: Array, s: Indices, t: Indices, blocks: Array) -> Array:
-    """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(3 · size, 3 · size)``, for ``(P, 3, 3)`` blocks."""
+    """Return ``Σ_p values[s]ᵀ blocks[p] values[t]``, ``(..., 3 · size, 3 · size)``.
+
+    For ``(..., P, 3, 3)`` blocks and ``(N, size)`` values.
+    """
+    *leading, pairs, _, _ = blocks.shape
     size = values.shape[1]
     places, local = local_support(values)
-    rows = 3 * places[s][:, :, None] + np.arange(3)
-    columns = 3 * places[t][:, :, None] + np.arange(3)
-    flat = rows[:, :, :, None, None] * (3 * size) + columns[:, None, None]
-    products = np.einsum("pb,pij,pc->pbicj", local[s], blocks, local[t], optimize=True)
-    total = np.bincount(flat.ravel(), products.ravel(), (3 * size) ** 2)
-    return np.asarray(total.reshape(3 * size, 3 * size), float)
+    rows = size * places[s][:, :, None] + places[t][:, None]
+    weights = local[s][:, :, None] * local[t][:, None]
+    ends = _SUPPORT**2 * np.arange(pairs + 1)
+    spread = scipy.sparse.csc_array((weights.ravel(), rows.ravel(), ends), shape=(size**2, pairs))
+    total = spread @ np.moveaxis(blocks, -3, 0).reshape(pairs, -1)
+    total = np.moveaxis(total.reshape(size, size, *leading, 3, 3), (0, 1), (-4, -2))
+    return np.asarray(total.reshape(*leading, 3 * size, 3 * size))

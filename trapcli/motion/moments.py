@@ -10,8 +10,7 @@ angles).
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,18 +30,18 @@ class MomentResiduals:
     Attributes
     ----------
     cost, degrees:
-        Misfit and its expectation.
+        ``(...)`` misfit and its expectation.
     gradient:
-        ``(G, 3)`` half the negative gradient by small rotations ε of each frame, ``R → R exp([ε]×)``.
+        ``(..., G, 3)`` half the negative gradient by small rotations ε of each frame, ``R → R exp([ε]×)``.
     slopes:
-        ``(G, C, 3)`` whitened derivatives of all components, tensors held.
+        ``(..., G, C, 3)`` whitened derivatives of all components, tensors held.
     design:
-        ``(G, C, U)`` whitened design of the U unknown tensor components.
+        ``(..., G, C, U)`` whitened design of the U unknown tensor components.
     normal:
-        ``(U, U)`` their normal matrix.
+        ``(..., U, U)`` their normal matrix.
     """
 
-    cost: float
+    cost: Array
     degrees: float
     gradient: Array
     slopes: Array
@@ -76,27 +75,40 @@ class MomentTable:
         part._orders = [order.select(start, stop) for order in self._orders]
         return part
 
-    def cost(self, R: Array) -> float:
-        """Return the misfit."""
-        return float(sum(order.eliminate(order.design(order.lab(R)))[2] for order in self._orders))
+    def cost(self, R: Array) -> Array:
+        """Return the ``(...)`` misfits of ``(..., G, 3, 3)`` rotations."""
+        return np.asarray(sum(order.eliminate(order.design(R))[2] for order in self._orders))
 
     def residuals(self, R: Array) -> list[MomentResiduals]:
-        """Return the misfit with its derivatives, for each order."""
+        """Return the misfits with their derivatives, for each order."""
         return [order.residuals(R) for order in self._orders]
 
 
 @dataclass(frozen=True)
 class _Order:
-    """Moments of one order: whitened values, whitening, and a basis of the symmetric tensors."""
+    """Moments of one order n: whitened values and whitening.
 
-    components: list[tuple[int, ...]]
+    Attributes
+    ----------
+    components:
+        ``(C, n)`` slots of the tensor components that the images show.
+    basis:
+        ``(U, 3ⁿ)`` basis of the symmetric tensors.
+    turning:
+        ``(3ⁿ, 3 · C)`` whitened change of what the images show of a tensor in lab coordinates by ε.
+    whitening, values:
+        ``(C, C)``; ``(G, C)`` whitened moments.
+    """
+
+    components: NDArray[np.intp]
     basis: Array
+    turning: Array
     whitening: Array
     values: Array
 
     @classmethod
     def create(cls, order: int, moments: Array, covariance: Array, extra: float) -> _Order:
-        components = list(itertools.combinations_with_replacement((0, 1), order))
+        components = np.array(list(itertools.combinations_with_replacement((0, 1), order)))
         basis = np.zeros((0, *(3,) * order))
         for chosen in itertools.combinations_with_replacement(range(3), order):
             tensor = np.zeros((3,) * order)
@@ -105,47 +117,58 @@ class _Order:
             basis = np.concatenate([basis, tensor[None]])
         total = covariance + extra**2 * np.eye(len(covariance))
         whitening = np.linalg.cholesky(np.linalg.inv(total)).T
-        return cls(components, basis, whitening, moments @ whitening.T)
+        unit = np.eye(3**order).reshape(-1, *(3,) * order)
+        # turning the frame by ε turns each slot of the tensor: dM = −Σ [ε] M
+        change = np.zeros((*unit.shape, 3))
+        for axis in range(1, unit.ndim):
+            turned = -np.einsum("eab,g...b->g...ae", _GENERATORS, np.moveaxis(unit, axis, -1))
+            change += np.moveaxis(turned, -2, axis)
+        turning = np.einsum("cd,gde->gce", whitening, change[:, *components.T])
+        return cls(
+            components,
+            basis.reshape(len(basis), -1),
+            turning.reshape(len(unit), -1),
+            whitening,
+            moments @ whitening.T,
+        )
 
     def select(self, start: int, stop: int) -> _Order:
-        return _Order(self.components, self.basis, self.whitening, self.values[start:stop])
+        return replace(self, values=self.values[start:stop])
 
-    def lab(self, R: Array) -> Array:
-        """Return the basis tensors in lab coordinates, ``(G, U, 3, 3[, 3])``."""
-        tensor = np.broadcast_to(self.basis, (len(R), *self.basis.shape))
-        for axis in range(2, self.basis.ndim + 1):
-            tensor = np.moveaxis(np.einsum("gia,gu...i->gu...a", R, np.moveaxis(tensor, axis, -1)), -1, axis)
-        return tensor
+    def design(self, R: Array) -> Array:
+        """Return the whitened ``(..., G, C, U)`` components seen in the images."""
+        axes = np.swapaxes(R, -1, -2)
+        products = np.ones((*R.shape[:-2], len(self.components), 1))
+        for slot in self.components.T:
+            products = products[..., None] * axes[..., slot, None, :]
+            products = products.reshape(*products.shape[:-2], -1)
+        return np.asarray(self.whitening @ (products @ self.basis.T))
 
-    def design(self, lab: Array) -> Array:
-        """Return the whitened ``(G, C, U)`` components seen in the images."""
-        return np.asarray(self.whitening @ np.swapaxes(self._seen(lab), 1, 2))
+    def lab(self, R: Array, tensor: Array) -> Array:
+        """Return ``(..., G, 3ⁿ)`` symmetric tensors of ``(..., U)`` components in lab coordinates."""
+        flat = (tensor @ self.basis)[..., None, :]
+        for _ in self.components.T:
+            # the first slot is turned and becomes the last
+            turned = np.swapaxes(flat.reshape(*flat.shape[:-1], 3, -1), -1, -2) @ R
+            flat = turned.reshape(*turned.shape[:-2], -1)
+        return flat
 
-    def _seen(self, tensors: Array) -> Array:
-        """Return the ``(..., C)`` components that the images show of ``(..., 3, 3[, 3])`` tensors."""
-        places: tuple[Any, ...] = (..., *np.transpose(self.components))
-        return np.asarray(tensors[places])
-
-    def eliminate(self, design: Array) -> tuple[Array, Array, float, Array]:
-        """Return the tensor, the residuals ``(G, C)``, their square and the normal matrix."""
-        flat = design.reshape(-1, design.shape[-1])
-        normal = flat.T @ flat
-        normal += 1e-12 * np.trace(normal) * np.eye(len(normal))
-        tensor = np.asarray(np.linalg.solve(normal, flat.T @ self.values.ravel()), float)
-        residual = self.values - design @ tensor
-        return tensor, residual, float(np.sum(residual**2)), normal
+    def eliminate(self, design: Array) -> tuple[Array, Array, Array, Array]:
+        """Return the tensors, the residuals ``(..., G, C)``, their squares and the normal matrices."""
+        unknowns = design.shape[-1]
+        flat = design.reshape(*design.shape[:-3], -1, unknowns)
+        across = np.swapaxes(flat, -1, -2)
+        normal = across @ flat
+        normal += 1e-12 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] * np.eye(unknowns)
+        tensor = np.asarray(np.linalg.solve(normal, (across @ self.values.ravel())[..., None]), float)
+        residual = self.values.ravel() - (flat @ tensor)[..., 0]
+        cost = np.asarray(np.sum(residual**2, axis=-1))
+        return tensor[..., 0], residual.reshape(design.shape[:-1]), cost, normal
 
     def residuals(self, R: Array) -> MomentResiduals:
-        lab = self.lab(R)
-        design = self.design(lab)
+        design = self.design(R)
         tensor, residual, cost, normal = self.eliminate(design)
-        whole = np.tensordot(lab, tensor, (1, 0))
-        # turning the frame by ε turns each slot of the tensor: dM = −Σ [ε] M
-        change = np.zeros((3, *whole.shape))
-        for axis in range(1, whole.ndim):
-            turned = -np.einsum("eab,g...b->eg...a", _GENERATORS, np.moveaxis(whole, axis, -1))
-            change += np.moveaxis(turned, -1, axis + 1)
-        slopes = np.einsum("cd,egd->gce", self.whitening, self._seen(change))
-        gradient = np.einsum("gce,gc->ge", slopes, residual)
+        slopes = (self.lab(R, tensor) @ self.turning).reshape(*residual.shape, 3)
+        gradient = np.einsum("...gce,...gc->...ge", slopes, residual)
         degrees = float(self.values.size - len(self.basis))
         return MomentResiduals(cost, degrees, gradient, slopes, design, normal)

@@ -64,16 +64,16 @@ class Spline:
 
 @dataclass(frozen=True)
 class Path:
-    """R and ω at ascending times.
+    """R and ω at ascending times. Several paths, on leading axes of R and ω, are bent at once.
 
     Attributes
     ----------
     time:
         ``(N,)``.
     R:
-        ``(N, 3, 3)`` rotations, lab to object coordinates.
+        ``(..., N, 3, 3)`` rotations, lab to object coordinates.
     omega:
-        ``(N, 3)`` angular velocity, ``RᵀR' = [ω]×`` (``eqDefOmega``) [rad / time].
+        ``(..., N, 3)`` angular velocity, ``RᵀR' = [ω]×`` (``eqDefOmega``) [rad / time].
     """
 
     time: Array
@@ -101,11 +101,12 @@ class Path:
         return Path(times, smooth.R[back], smooth.omega[back])
 
     def bent(self, spline: Spline, coefficients: Array) -> Path:
-        """Return ``R exp([δ]×)`` for the spline δ with ``(size, 3)`` coefficients [rad]."""
+        """Return ``R exp([δ]×)`` for the spline δ with ``(..., size, 3)`` coefficients [rad]."""
         delta, slope = spline.values(self.time) @ coefficients, spline.slopes(self.time) @ coefficients
-        turn = Rotation.from_rotvec(delta)
-        omega = turn.inv().apply(self.omega) + np.einsum("nij,nj->ni", _right_jacobian(delta), slope)
-        return Path(self.time, orthonormal(self.R @ turn.as_matrix()), omega)
+        turn = Rotation.from_rotvec(delta.reshape(-1, 3)).as_matrix().reshape(self.R.shape)
+        omega = np.einsum("...ji,...j->...i", turn, self.omega)
+        omega += np.einsum("...ij,...j->...i", _right_jacobian(delta), slope)
+        return Path(self.time, orthonormal(self.R @ turn), omega)
 
     def planar(self) -> Path:
         """Return the part of the path that turns about the optical axis, from its first time on."""
@@ -135,8 +136,8 @@ class Path:
 
 
 def orthonormal(R: Array) -> Array:
-    """Return ``(N, 3, 3)`` rotations after one Newton step back to SO(3), for rounding that accumulates."""
-    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, 1, 2) @ R))
+    """Return ``(..., 3, 3)`` rotations after one Newton step back to SO(3), for rounding that accumulates."""
+    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R))
 
 
 def cross_matrix(v: Array) -> Array:
@@ -168,8 +169,8 @@ def align(R: Array, reference: Array) -> tuple[Array, bool]:
 
 
 def _right_jacobian(delta: Array) -> Array:
-    """Return J_r(δ), ``(N, 3, 3)``: exp([δ + dδ]×) = exp([δ]×) exp([J_r dδ]×)."""
-    angle = np.linalg.norm(delta, axis=-1)[:, None, None]
+    """Return J_r(δ), ``(..., 3, 3)``: exp([δ + dδ]×) = exp([δ]×) exp([J_r dδ]×)."""
+    angle = np.linalg.norm(delta, axis=-1)[..., None, None]
     small = angle < 1e-4
     safe = np.where(small, 1.0, angle)
     first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
