@@ -230,7 +230,7 @@ def _refine(
     path = coarse.fit(path, low.time, rough, smooth=False).path
     if not knots:
         path = coarse.fit(path, low.time, fine).path
-    model = ObjectModel(low, band)
+    model = ObjectModel.simplest(low, band, path.R[-len(low.time) :])
     fit = model.fit(path, low.time, fine, smooth=not knots)
     fit, assessment = _simplest(model, fit, model.assess(fit))
     if fit.cost / assessment.degrees > CERTIFIED:

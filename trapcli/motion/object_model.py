@@ -41,7 +41,9 @@ from trapcli.motion.threads import in_parallel, processors
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_GUARD = 6.0  # half the gap between the band and its periodic image, times the object's radius
+GUARDS = (3.0, 4.5, 6.0)
+"""Guards of the lattice that are tried, see `ObjectModel`."""
+
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
 _PROBES = 2  # objects that are fitted to noise alone
@@ -131,6 +133,9 @@ class ObjectModel:
         Modes of G frames; those beyond `band` are not used.
     band:
         Highest spatial frequency [rad / length].
+    guard:
+        Half the gap between the band and its periodic image, times the object's radius: the wider, the finer
+        the lattice, and the sharper the edges that it can show.
     variance:
         ``(K,)`` noise of each mode of `low`, model error included; None for white noise.
     weights:
@@ -138,17 +143,23 @@ class ObjectModel:
     """
 
     def __init__(
-        self, low: LowBand, band: float, *, variance: Array | None = None, weights: Array | None = None
+        self,
+        low: LowBand,
+        band: float,
+        *,
+        guard: float = GUARDS[-1],
+        variance: Array | None = None,
+        weights: Array | None = None,
     ) -> None:
         inside = np.hypot(low.k[:, 0], low.k[:, 1]) <= band * (1 + 1e-9)
         self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
-        self.band = band
+        self.band, self.guard = band, guard
         self.variance = np.full(inside.sum(), low.variance) if variance is None else variance[inside]
         self.weights = np.ones(len(low.time)) if weights is None else weights
         self._share = conjugate_share(self.low.k)
         self._root = np.sqrt(self.weights[:, None] * self._share / self.variance)
         # of a cubic lattice that repeats the spectrum as far away as the body-centred one does
-        spacing = np.pi / (band + _GUARD / low.radius)
+        spacing = np.pi / (band + guard / low.radius)
         self.spacing = spacing / np.sqrt(2)
         reach = low.radius + _MARGIN * spacing
         self._half = int(reach / self.spacing)
@@ -177,7 +188,22 @@ class ObjectModel:
     @classmethod
     def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
         """Return the model whose noise is raised, mode by mode, to what a fit has left over."""
-        return cls(fit.low, band, variance=fit.low.variance * np.maximum(assessment.mode_misfit, 1.0))
+        variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
+        return cls(fit.low, band, guard=fit.model.guard, variance=variance)
+
+    @classmethod
+    def simplest(cls, low: LowBand, band: float, R: Array) -> ObjectModel:
+        """Return the model of the guard that explains ``(G, 3, 3)`` rotations with the fewest amplitudes.
+
+        By Akaike's criterion (1974, DOI 10.1109/TAC.1974.1100705): a smooth object needs a coarser lattice
+        than one with sharp edges, and amplitudes that it does not need only follow the noise.
+        """
+
+        def surprise(model: ObjectModel) -> float:
+            views = model._views(R)
+            return model._cost(views, model.low.modes) + 2 * views.seen
+
+        return min((cls(low, band, guard=guard) for guard in GUARDS), key=surprise)
 
     @property
     def data_count(self) -> float:
