@@ -164,10 +164,13 @@ def _look(attenuation: Frames) -> _Look:
     peak = float(np.quantile(images, 0.9999) - np.median(images))
     faintest = _LEAST_VISIBLE * peak
     least = max(noise, faintest)
-    levels = noise / b, least / b, 2 * least / b
-    reach, visible, inner = (b * r for r in in_parallel(partial(object_radius, images), levels))
-    # what the noise hides of the object goes on falling, as a Gaussian does, as it fell before
     hidden = max(float(np.log2(least / (_HIDDEN * faintest))), 0.0) if faintest > 0 else 0.0
+    levels = sorted({noise, least, 2 * least} if hidden else {noise, least})
+    radii = in_parallel(partial(object_radius, images), [level / b for level in levels])
+    at = dict(zip(levels, (b * radius for radius in radii), strict=True))
+    reach, visible = at[noise], at[least]
+    # what the noise hides of the object goes on falling, as a Gaussian does, as it fell before
+    inner = at.get(2 * least, visible)
     whole = float(np.sqrt(visible**2 + hidden * max(visible**2 - inner**2, 0.0)))
     # but no farther than the frame does
     radius = min(whole, _MOST_HIDDEN * visible, max(visible, min(shape) / 2 / SQUARE))
