@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -100,11 +102,12 @@ def _is_written(job: Job) -> bool:
 
 
 def _estimate(job: Job, progress: Callable[[str, int, int], None] | None) -> Outcome:
-    from trapcli.pipeline import estimate
     from trapcli.stack import open_stack
 
     frames = open_stack(job.source, job.config.input)
     with _checksums(job, frames) as checksums:
+        from trapcli.pipeline import estimate  # takes a while: checksums are taken meanwhile
+
         motion = estimate(frames, config=job.config, progress=progress)
     origin = {"command_line": job.command_line, "inputs": checksums()}
     replace(motion, provenance=motion.provenance | origin).save(job.output, overwrite=job.overwrite)
@@ -135,13 +138,19 @@ def _checksums(job: Job, frames: Frames) -> Iterator[Callable[[], str]]:
     if processors() == 1:
         yield lines
         return
-    with ThreadPoolExecutor(1) as thread:
+    with ThreadPoolExecutor(1, initializer=_give_way) as thread:
         told = thread.submit(lines)
         try:
             yield told.result
         except BaseException:
             stopped.set()
             raise
+
+
+def _give_way() -> None:
+    """Let this thread, where the system can, have only what the others leave of the processors."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 19)
 
 
 def _outcome(job: Job, motion: Motion) -> Outcome:

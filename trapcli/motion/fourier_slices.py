@@ -22,6 +22,7 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 
 _DOUBLE_PRECISION = 1e-12
 _SINGLE_PRECISION = 2e-5
+_FEW = 30_000  # values up to which a second thread costs what it gains
 _SPARE = 1.25  # finer grid of the transforms in single precision, which saves memory
 
 
@@ -76,7 +77,7 @@ def project(points: list[Array], lattice: Real | Complex, accuracy: float = _DOU
             *_in_precision(points, single),
             lattice.astype(kind, copy=False),
             isign=-1,
-            **_options(single, accuracy),
+            **_options(single, lattice[..., 0, 0, 0].size * points[0].size, accuracy),
         )
     )
 
@@ -98,7 +99,7 @@ def back_project(points: list[Array], values: Complex, size: int) -> Real:
     """
     single = values.dtype == np.complex64
     lattice = finufft.nufft3d1(
-        *_in_precision(points, single), values, (size,) * 3, isign=1, **_options(single)
+        *_in_precision(points, single), values, (size,) * 3, isign=1, **_options(single, values.size)
     )
     return np.asarray(lattice.real)
 
@@ -107,10 +108,11 @@ def _in_precision(points: list[Array], single: bool) -> list[Real]:
     return [p.astype(np.float32 if single else np.float64, copy=False) for p in points]
 
 
-def _options(single: bool, accuracy: float = _DOUBLE_PRECISION) -> dict[str, Any]:
+def _options(single: bool, values: int, accuracy: float = _DOUBLE_PRECISION) -> dict[str, Any]:
+    threads = processors() if values > _FEW else 1
     if single:
-        return {"eps": _SINGLE_PRECISION, "upsampfac": _SPARE, "nthreads": processors()}
-    return {"eps": accuracy, "upsampfac": 2.0, "nthreads": processors()}
+        return {"eps": _SINGLE_PRECISION, "upsampfac": _SPARE, "nthreads": threads}
+    return {"eps": accuracy, "upsampfac": 2.0, "nthreads": threads}
 
 
 class NormalOperator:

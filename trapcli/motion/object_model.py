@@ -23,7 +23,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from operator import call
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
-from trapcli.motion.threads import in_parallel, processors
+from trapcli.motion.threads import in_parallel
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -203,7 +204,8 @@ class ObjectModel:
             views = model._views(R)
             return model._cost(views, model.low.modes) + 2 * views.seen
 
-        return min((cls(low, band, guard=guard) for guard in GUARDS), key=surprise)
+        models = [cls(low, band, guard=guard) for guard in GUARDS]
+        return models[int(np.argmin(in_parallel(surprise, models)))]
 
     @property
     def data_count(self) -> float:
@@ -248,10 +250,16 @@ class ObjectModel:
         by_noise: Array | None = None
         for _ in range(steps):
             state = self._linearized(now.views, now.modes, now.solution)
-            eliminated = self._eliminated(now.views, state, values)
+            seen_slopes, eliminated = in_parallel(
+                call,
+                (
+                    partial(self._seen_slopes, now.views),
+                    partial(self._eliminated, now.views, state, values),
+                ),
+            )
             if by_noise is None:
                 by_noise = self._noise_hessian(now.views, state, eliminated, values)
-            downhill, still, hope = self._downhill(now.views, state, eliminated, values)
+            downhill, still, hope = self._downhill(now.views, state, eliminated, seen_slopes, values)
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
             informed = _informed(hessian, by_noise[np.ix_(bent, bent)])
             hessian, downhill = informed @ hessian @ informed.T, informed @ downhill[bent]
@@ -464,14 +472,14 @@ class ObjectModel:
         return model, np.concatenate([slopes, shifts], axis=-1)
 
     def _downhill(
-        self, views: _Views, state: _State, eliminated: Eliminated, values: Array
+        self, views: _Views, state: _State, eliminated: Eliminated, seen_slopes: Array, values: Array
     ) -> tuple[Array, Array, float]:
         """Return half the gradient, ``(P,)``, and ``(G, 2)`` shifts, where the object and the shifts follow.
 
         The shifts are those that lessen the misfit most while the motion stays; by how much comes last.
         """
         gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
-        turning, shifting = gradient[:, :3] - 0.5 * self._seen_slopes(views), gradient[:, 3:]
+        turning, shifting = gradient[:, :3] - 0.5 * seen_slopes, gradient[:, 3:]
         turning -= np.einsum("gij,gj->gi", eliminated.carry, shifting)
         alone = np.einsum("gij,gj->gi", eliminated.shift_covariance, shifting)
         pull = self._right(views, np.einsum("gki,gi->gk", state.slopes[..., 3:], alone))
@@ -554,13 +562,6 @@ class ObjectModel:
 
     def _back_projected(self, R: Array, modes: ComplexArray) -> Array:
         """Return ``(g, n, C)`` sums ``Re Σ_k exp(i⟨R k, b⟩) modes`` of ``(g, K, C)`` modes, folded."""
-        share = min(processors(), len(R))
-        parts = in_parallel(
-            self._back_projected_alone, np.array_split(R, share), np.array_split(modes, share)
-        )
-        return np.concatenate(parts)
-
-    def _back_projected_alone(self, R: Array, modes: ComplexArray) -> Array:
         count = len(self._half_index)
         i1, i2, i3 = (self._half_index + self._half).T
         folded = np.empty((len(R), 2 * count - 1, modes.shape[-1]))
