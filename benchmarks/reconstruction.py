@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 import trapcli
 from trapcli.config import from_dict
-from trapcli.motion.threads import processors
 from trapcli.reconstruction.alignment import align
 from trapcli.reconstruction.coverage import LIMITED, cover
 from trapcli.reconstruction.geometry import Detector, angle_blocks, astra_blocks, npz, relion_blocks
@@ -34,6 +33,7 @@ from trapcli.result.motion import Motion
 from trapcli.simulation.config import SimulateConfig
 from trapcli.simulation.render import Scene
 from trapcli.stack.frames import Frames
+from trapcli.threads import processors
 
 Array = NDArray[np.float64]
 

@@ -117,9 +117,9 @@ def _estimate(job: Job, progress: Callable[[str, int, int], None] | None) -> Out
 @contextlib.contextmanager
 def _checksums(job: Job, frames: Frames) -> Iterator[Callable[[], str]]:
     """Take the checksums of the files that are read while the block runs; yield what returns their lines."""
-    from trapcli.motion.threads import processors
     from trapcli.result import provenance
     from trapcli.stack import open_stack
+    from trapcli.threads import processors
 
     preprocess = job.config.preprocess
     given = [] if preprocess.background in GUESSED_BACKGROUNDS else [preprocess.background]

@@ -14,7 +14,7 @@ import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
-from trapcli.motion.threads import in_parallel
+from trapcli.threads import in_parallel
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

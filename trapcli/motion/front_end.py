@@ -28,10 +28,10 @@ from trapcli.motion.centers import (
 )
 from trapcli.motion.low_band import SQUARE, LowBand, LowBandReader
 from trapcli.motion.reduced_map import BandReader
-from trapcli.motion.threads import in_parallel
 from trapcli.motion.types import ReducedMap
 from trapcli.stack.ahead import read_ahead
 from trapcli.stack.frames import Frames
+from trapcli.threads import in_parallel
 
 Array = NDArray[np.float64]
 

@@ -37,7 +37,7 @@ from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
-from trapcli.motion.threads import in_parallel
+from trapcli.threads import in_parallel
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]

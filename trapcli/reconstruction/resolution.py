@@ -9,7 +9,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from trapcli.motion.threads import processors
+from trapcli.threads import processors
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from trapcli.errors import InputError
 from trapcli.motion.centers import object_radius, pixel_noise, sample_frames
 from trapcli.motion.fourier_slices import conjugate_share
-from trapcli.motion.threads import processors
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
+from trapcli.threads import processors
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex64]

@@ -23,8 +23,8 @@ from trapcli.motion.fourier_slices import (
     circulant_density,
     slice_points,
 )
-from trapcli.motion.threads import processors
 from trapcli.reconstruction.slices import SliceReader
+from trapcli.threads import processors
 
 Array = NDArray[np.float64]
 Lattice = NDArray[np.float32]

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from trapcli.motion.threads import in_parallel, processors
+from trapcli.threads import in_parallel, processors
 
 
 def test_threads(monkeypatch: pytest.MonkeyPatch) -> None:
