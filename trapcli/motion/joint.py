@@ -25,7 +25,15 @@ from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Spline, align
 from trapcli.motion.types import ReducedMap
-from trapcli.motion.verdict import CERTIFIED, Stack, judge, nothing_known, to_motion
+from trapcli.motion.verdict import (
+    CERTIFIED,
+    COARSE,
+    Stack,
+    judge,
+    largest_error,
+    nothing_known,
+    to_motion,
+)
 from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
 
@@ -56,6 +64,7 @@ _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
+_SETTLED = 1.02  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
 _MOST_REFINED = 4  # hypotheses that are refined at most
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
@@ -127,13 +136,18 @@ def estimate_joint(
         fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
         best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
         refined += len(fits)
-        if best[0].cost <= CERTIFIED * best[1].degrees or refined >= _MOST_REFINED:
+        if _settled(*best, len(time)) or refined >= _MOST_REFINED:
             break
     assert best is not None
     fit, assessment = best
     verdict = judge(fit, assessment)
     unseen = unseen_turn(fit, assessment, fine_band) if verdict.identifiable else None
     return to_motion(stack, fit, assessment, verdict, unseen)
+
+
+def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
+    """Tell whether no other motion need be tried: far from this one, none fits nearly as well."""
+    return fit.cost <= _SETTLED * assessment.degrees and largest_error(fit, assessment, n) <= COARSE
 
 
 def _outliers(low: LowBand) -> Bools:
@@ -266,9 +280,13 @@ def _relative_noise(stack: Stack) -> float:
 
 
 def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fit, Assessment]:
-    """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest."""
-    excess = np.maximum(assessment.mode_misfit, 1.0)
-    model = ObjectModel.after(fit, assessment, band)
+    """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest.
+
+    What an imperfect model leaves is much alike from group to group, and so many groups say it but once.
+    """
+    misfit = assessment.mode_misfit
+    excess = np.where(misfit > 1, misfit * _alike(fit.normal.residual), 1.0)
+    model = ObjectModel.after(fit, replace(assessment, mode_misfit=excess), band)
     again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
@@ -285,3 +303,12 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
         frame_misfit=assessment.frame_misfit,
         mode_misfit=honest.mode_misfit * excess,
     )
+
+
+def _alike(residual: NDArray[np.complex128]) -> float:
+    """Return the autocorrelation time of ``(G, K)`` residuals [groups], up to the first lag without any."""
+    lags = range(len(residual) // 2)
+    power = [float(np.sum((residual[: len(residual) - lag].conj() * residual[lag:]).real)) for lag in lags]
+    uncorrelated = np.flatnonzero(np.array(power) <= 0)
+    last = uncorrelated[0] if len(uncorrelated) else len(power)
+    return 1 + 2 * sum(power[1:last]) / power[0]

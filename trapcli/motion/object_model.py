@@ -695,6 +695,11 @@ class Normal:
     eliminated: Eliminated
     by_noise: Array
 
+    @property
+    def residual(self) -> ComplexArray:
+        """``(G, K)`` what the motion leaves of the modes, in units of their noise."""
+        return self.state.residual
+
 
 @dataclass(frozen=True)
 class _State:

@@ -27,7 +27,9 @@ CERTIFIED = 1.06
 
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
-_COARSE = np.deg2rad(1.0)  # error of R from which on the verdict mentions it
+COARSE = np.deg2rad(1.0)
+"""Error of R from which on the verdict mentions it."""
+
 _TOUCHED = 0.1  # share of an unseen turn in a component of ω that makes it unknown
 
 
@@ -119,6 +121,13 @@ def nothing_known(stack: Stack, text: str) -> Motion:
     )
 
 
+def largest_error(fit: Fit, assessment: Assessment, n: int) -> float:
+    """Return the largest error of the orientation in N frames, against the first [rad]."""
+    values = fit.spline.values(fit.path.time[:n])
+    covariance = _rotation_covariance(fit.path.R[:n], values, assessment.covariance)
+    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max()))
+
+
 def _flags(stack: Stack) -> NDArray[np.uint16]:
     flags = np.zeros(len(stack.seen), np.uint16)
     flags[~stack.seen] |= np.uint16(Flag.BLANK)
@@ -159,7 +168,7 @@ def to_motion(
             "the images leave the rotation open by more than 20 degrees: "
             "a symmetric object, too much noise or too little rotation"
         )
-    elif identifiable and (largest := float(np.linalg.norm(R_errors[valid], axis=1).max())) > _COARSE:
+    elif identifiable and (largest := float(np.linalg.norm(R_errors[valid], axis=1).max())) > COARSE:
         text += f"; errors of the orientation reach {np.rad2deg(largest):.1f} degrees (1 sigma)"
 
     def where_judged(values: Array) -> Array:
