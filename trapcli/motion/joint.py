@@ -30,9 +30,9 @@ from trapcli.motion.verdict import (
     COARSE,
     Stack,
     judge,
-    largest_error,
     nothing_known,
     to_motion,
+    typical_error,
 )
 from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
@@ -64,7 +64,7 @@ _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
-_SETTLED = 1.02  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
+_SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
 _MOST_REFINED = 4  # hypotheses that are refined at most
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
@@ -147,7 +147,7 @@ def estimate_joint(
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
     """Tell whether no other motion need be tried: far from this one, none fits nearly as well."""
-    return fit.cost <= _SETTLED * assessment.degrees and largest_error(fit, assessment, n) <= COARSE
+    return fit.cost <= _SETTLED * assessment.degrees and typical_error(fit, assessment, n) <= COARSE
 
 
 def _outliers(low: LowBand) -> Bools:

@@ -121,11 +121,11 @@ def nothing_known(stack: Stack, text: str) -> Motion:
     )
 
 
-def largest_error(fit: Fit, assessment: Assessment, n: int) -> float:
-    """Return the largest error of the orientation in N frames, against the first [rad]."""
+def typical_error(fit: Fit, assessment: Assessment, n: int) -> float:
+    """Return the root mean square error of the orientation in N frames, against the first [rad]."""
     values = fit.spline.values(fit.path.time[:n])
     covariance = _rotation_covariance(fit.path.R[:n], values, assessment.covariance)
-    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).max()))
+    return float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean()))
 
 
 def _flags(stack: Stack) -> NDArray[np.uint16]:
