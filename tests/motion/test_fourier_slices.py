@@ -52,6 +52,15 @@ def test_back_projection_is_the_adjoint(points, kind, tolerance):
     assert project(points, lattice).dtype == values.dtype
 
 
+@pytest.mark.parametrize("accuracy", [1e-6, 1e-10])
+def test_projection_is_as_accurate_as_asked(points, accuracy):
+    lattice = np.random.default_rng(4).standard_normal((7, 7, 7))
+    b = np.stack(np.meshgrid(*3 * [np.arange(7) - 3], indexing="ij"), axis=-1).reshape(-1, 3)
+    exact = np.exp(-1j * np.transpose(points) @ b.T) @ lattice.ravel()
+    off = np.linalg.norm(project(points, lattice, accuracy) - exact) / np.linalg.norm(exact)
+    assert off < 10 * accuracy
+
+
 def test_several_lattices_at_once(points):
     lattices = np.random.default_rng(3).standard_normal((2, 6, 6, 6))
     both = project(points, lattices)

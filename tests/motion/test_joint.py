@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +199,17 @@ def test_blank_frames_are_left_out(tumbling: tuple[Motion, Motion, Images]) -> N
     assert errors(found, truth).errors["R_aligned"].mean < 0.5
     assert {stage for stage, _, _ in stages} >= {"frames", "branches"}
     assert all(0 <= done <= total for _, done, total in stages)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6, 0.9])
+def test_frames_over_which_a_residual_is_alike(share: float) -> None:
+    """The autocorrelation time of a first-order autoregression with coefficient ρ is (1 + ρ) / (1 − ρ)."""
+    rng = np.random.default_rng(6)
+    residual = rng.normal(size=(400, 300)) + 1j * rng.normal(size=(400, 300))
+    for before, after in pairwise(residual):
+        after *= np.sqrt(1 - share**2)
+        after += share * before
+    assert joint._alike(residual) == pytest.approx((1 + share) / (1 - share), rel=0.1)
 
 
 def test_too_few_frames() -> None:
