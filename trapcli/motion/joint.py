@@ -146,7 +146,7 @@ def estimate_joint(
 
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
-    """Tell whether no other motion need be tried: far from this one, none fits nearly as well."""
+    """Tell whether a motion explains the images and is told so well that no other need be tried."""
     return fit.cost <= _SETTLED * assessment.degrees and typical_error(fit, assessment, n) <= COARSE
 
 
