@@ -136,16 +136,13 @@ def _axis_of_revolution(model: ObjectModel, R: Array, axes: Array) -> Array | No
         axis = axes[0] + tangent @ axes[1:]
         return np.asarray(axis / np.linalg.norm(axis))
 
-    def resists(axis: Array, spin: float) -> bool:
-        return resistance(axis, spin) > _WEAK * resistance(axes[1], spin)
-
-    if resists(axes[0], _SMALL_SPIN):
+    # what is seen from few sides only resists a small spin about the optical axis alone
+    if any(resistance(axes[0], spin) > _WEAK * resistance(axes[1], spin) for spin in (_SMALL_SPIN, _SPIN)):
         return None
     simplex = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1.0, "maxfev": 60}
-    best = near(minimize(lambda x: resistance(near(x)), simplex[0], method="Nelder-Mead", options=options).x)
-    # what is seen from few sides only resists a small spin about the optical axis alone
-    return None if resists(best, _SPIN) else best
+    best = minimize(lambda x: resistance(near(x)), simplex[0], method="Nelder-Mead", options=options)
+    return near(best.x)
 
 
 def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTurn | None:
