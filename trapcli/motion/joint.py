@@ -289,7 +289,7 @@ def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fi
     model = ObjectModel.after(fit, replace(assessment, mode_misfit=excess), band)
     again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
-    again = replace(again, shift=again.shift + fit.shift, cost=fit.cost)
+    again = replace(again, shift=again.shift + fit.shift, cost=fit.cost, known=again.normal)
     covariance = honest.covariance
     if fit.axes == (2,):
         # errors out of the image plane, which the richer motion told, grow as those in the plane do

@@ -714,7 +714,7 @@ class _State:
 def _without_shifts(
     turns: ComplexArray, shifts: ComplexArray, covariance: Array
 ) -> tuple[Array, ComplexArray]:
-    """Return the slopes by rotation without those by shift, after the ``(G, 3, 2)`` share of these."""
+    """Return the ``(G, 3, 2)`` share that the slopes by shift have in those by rotation, and the rest."""
     carry = np.einsum("gki,gkj->gij", turns.conj(), shifts).real @ covariance
     return carry, turns - shifts @ carry.transpose(0, 2, 1)
 
