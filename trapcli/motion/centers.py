@@ -44,6 +44,7 @@ _OUTSIDE = 0.1  # share of the frame outside the object's disc that tells the le
 _CONVERGED = 1e-9  # step that ends the iteration [pixels]
 _FINE = 0.01  # or in units of the error that the noise makes
 _MOST_STEPS = 50
+_FAINT = 0.8  # share of the highest modes, the faintest, that tells the noise
 _BLOCK = 16  # edge of the blocks in which a codec's loss is looked for [pixels]
 _FEWEST_BLOCKS = 4  # along an edge of the frame
 _EVEN = (0.2, 0.35), (0.35, 0.5)  # bands that a codec leaves as they are, in units of the highest frequency
@@ -226,12 +227,23 @@ def _corner_noise(images: NDArray[Any]) -> float:
     k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
     k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
     corner = np.minimum(k1, k2) > 0.7
-    window = np.hanning(images.shape[1])[:, None] * np.hanning(images.shape[2])
-    powers = [
-        np.median(np.abs(rfft2(image * window)[corner]) ** 2) / np.log(2) / np.sum(window**2)
-        for image in images
-    ]
+    window = _taper(images.shape[1])[:, None] * _taper(images.shape[2])
+    powers = [_faint_mean(np.abs(rfft2(image * window)[corner]) ** 2) / np.sum(window**2) for image in images]
     return float(np.sqrt(np.median(powers)))
+
+
+def _taper(size: int) -> Array:
+    """Return a window that rises over a quarter of its `size` at each end, as a cosine does (Tukey)."""
+    place = np.arange(size) + 0.5
+    return np.asarray(np.sin(np.pi / 2 * np.minimum(1.0, 4 / size * np.minimum(place, size - place))) ** 2)
+
+
+def _faint_mean(power: Array) -> float:
+    """Return the mean power of noise, told by the faintest modes: what is bright may be something else."""
+    faintest = np.sort(power)[: int(np.ceil(_FAINT * len(power)))]
+    # this is what the faintest share of exponentially distributed powers holds of their sum
+    held = _FAINT + (1 - _FAINT) * np.log1p(-_FAINT)
+    return float(faintest.sum() / len(power) / held)
 
 
 def _uncut_noise(images: NDArray[Any]) -> float:

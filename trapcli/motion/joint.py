@@ -57,7 +57,10 @@ _ATTEMPTS = (
     (120, 0.5),
 )  # first window [groups] and where it lies
 _FITS = 1.5  # misfit per degree of freedom of lines and moments at which no other window is tried
-_RIVAL = 1.3  # cost, in units of the best's, up to which a hypothesis is refined as well
+_LIKELY = 1.3  # cost, in units of the best's, up to which a hypothesis is looked into further
+_MOST_HYPOTHESES = 8  # of them at most
+_RIVAL = 1.1  # misfit of a coarse model, in units of the best's, up to which a fine one is fitted as well
+_MOST_REFINED = 2  # of them at most
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
@@ -65,7 +68,6 @@ _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
-_MOST_REFINED = 4  # hypotheses that are refined at most
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
 
@@ -130,19 +132,50 @@ def estimate_joint(
             "nothing changes between the frames beyond the noise: the object is still, "
             "or turns about an axis of symmetry; no rotation can be told",
         )
-    best: tuple[Fit, Assessment] | None = None
-    refined = 0
-    for found in _hypotheses(stack, used, pace, progress):
-        fits = [_refine(stack, used, h, pace, fine_band, config.knots) for h in found]
-        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
-        refined += len(fits)
-        if _settled(*best, len(time)) or refined >= _MOST_REFINED:
-            break
-    assert best is not None
-    fit, assessment = best
+    fit, assessment = _best_motion(stack, used, pace, fine_band, config.knots, progress)
     verdict = judge(fit, assessment)
     unseen = unseen_turn(fit, assessment, fine_band) if verdict.identifiable else None
     return to_motion(stack, fit, assessment, verdict, unseen)
+
+
+def _best_motion(
+    stack: Stack, used: NDArray[np.intp], pace: float, band: float, knots: int, progress: Progress | None
+) -> tuple[Fit, Assessment]:
+    """Return the motion that explains the frames best, of all hypotheses that are worth a look."""
+    fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
+    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
+    _, low = _grouped(stack, used, size)
+    known: list[Fit] = []
+    best: tuple[Fit, Assessment] | None = None
+    for hypotheses in _hypotheses(stack, used, pace, progress):
+        # a coarse model of the object tells right from wrong far better than lines and moments do
+        coarse = _coarse_fits(hypotheses, low, stack.low.time, band, knots)
+        new = _distinct(coarse, known)[:_MOST_REFINED]
+        known += new
+        fits = [_fine_fit(fit, low, band, smooth=not knots) for fit in new]
+        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
+        if _settled(*best, len(stack.low.time)):
+            break
+    assert best is not None
+    fit, assessment = best
+    if fit.cost / assessment.degrees > CERTIFIED:
+        return _with_model_error(fit, assessment, band)
+    return best
+
+
+def _distinct(fits: list[Fit], known: list[Fit]) -> list[Fit]:
+    """Return the fits that come near to the best of all, best first, each of a motion of its own."""
+
+    def differ(fit: Fit, other: Fit) -> bool:
+        R, other_R = (f.path.R[-len(f.low.time) :] for f in (fit, other))
+        return bool(align(R, other_R)[0].mean() > _SAME)
+
+    least = min(fit.cost for fit in (*fits, *known))
+    new: list[Fit] = []
+    for fit in sorted(fits, key=lambda fit: fit.cost):
+        if fit.cost <= _RIVAL * least and all(differ(fit, other) for other in (*known, *new)):
+            new.append(fit)
+    return new
 
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
@@ -204,7 +237,7 @@ def _grouped(stack: Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMa
 def _hypotheses(
     stack: Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
 ) -> Iterator[list[Hypothesis]]:
-    """Yield motions that common lines and moments allow, best first, until one of them is good enough."""
+    """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
     size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
     reduced, low = _grouped(stack, used, size)
     evidence = Evidence(low.time, LineTable(reduced, _LINE_ERROR), MomentTable(low, _MOMENT_ERROR))
@@ -213,43 +246,52 @@ def _hypotheses(
     for attempt, (window, middle) in enumerate(_ATTEMPTS):
         tried = replace(evidence, seed=attempt)
         for path in (h.path for h in find_branches(tried, window=window, middle=middle, progress=progress)):
-            if all(align(path.R, h.path.R)[0].mean() > _SAME for h in yielded):
+            if all(align(path.R, h.path.R)[0].mean() > _SAME for h in (*yielded, *waiting)):
                 waiting.append(evidence.judge(path))
         waiting.sort(key=lambda h: h.cost)
         fits = waiting and waiting[0].lines < _FITS and waiting[0].moments < _FITS
-        if fits or (waiting and attempt == len(_ATTEMPTS) - 1):
-            chosen = [h for h in waiting[:2] if h.cost <= _RIVAL * waiting[0].cost]
+        if waiting and (attempt == len(_ATTEMPTS) - 1 or (fits and not yielded)):
+            most = _MOST_HYPOTHESES if yielded else _MOST_REFINED
+            chosen = [h for h in waiting[:most] if h.cost <= _LIKELY * waiting[0].cost]
             yield chosen
             yielded += chosen
             waiting = []
 
 
-def _refine(
-    stack: Stack, used: NDArray[np.intp], hypothesis: Hypothesis, pace: float, band: float, knots: int
-) -> tuple[Fit, Assessment]:
-    """Fit the object model along a hypothesis, with as many knots as the data pay for."""
-    fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
-    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
-    _, low = _grouped(stack, used, size)
-    time = stack.low.time
-    turned = float(np.linalg.norm(hypothesis.path.mean_omega(), axis=1).mean() * np.ptp(low.time))
-    rough, fine = (
-        Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3, _MOST_KNOTS))
-        for least, angle in zip(_FEWEST_KNOTS, (_COARSE_KNOTS, _FINE_KNOTS), strict=True)
-    )
+def _coarse_fits(
+    hypotheses: list[Hypothesis], low: LowBand, time: Array, band: float, knots: int
+) -> list[Fit]:
+    """Fit a coarse object model along hypotheses, with as many knots as turns may need where it pays."""
+    model = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
+    first: list[Fit] = []
+    finer: list[Spline] = []
+    for path in (h.path for h in hypotheses):
+        turned = float(np.linalg.norm(path.mean_omega(), axis=1).mean() * np.ptp(low.time))
+        rough, fine = (
+            Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3, _MOST_KNOTS))
+            for least, angle in zip(_FEWEST_KNOTS, (_COARSE_KNOTS, _FINE_KNOTS), strict=True)
+        )
+        if knots:
+            rough = fine = Spline(time[0], time[-1], knots)
+        near = path.near(rough, np.concatenate([time, fine.grid, low.time]))
+        first.append(model.fit(near, low.time, rough, smooth=False))
+        finer.append(fine)
     if knots:
-        rough = fine = Spline(time[0], time[-1], knots)
-    path = hypothesis.path.near(rough, np.concatenate([time, fine.grid, low.time]))
-    coarse = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
-    path = coarse.fit(path, low.time, rough, smooth=False).path
-    if not knots:
-        path = coarse.fit(path, low.time, fine).path
+        return first
+    least = min(fit.cost for fit in first)
+    return [
+        model.fit(fit.path, low.time, spline)
+        for fit, spline in zip(first, finer, strict=True)
+        if fit.cost <= _LIKELY * least
+    ]
+
+
+def _fine_fit(coarse: Fit, low: LowBand, band: float, *, smooth: bool) -> tuple[Fit, Assessment]:
+    """Go on with as fine an object model as the frames pay for, and judge the motion by it."""
+    path, spline = coarse.path, coarse.spline
     model = ObjectModel.simplest(low, band, path.R[-len(low.time) :])
-    fit = model.fit(path, low.time, fine, smooth=not knots)
-    fit, assessment = _simplest(model, fit, model.assess(fit))
-    if fit.cost / assessment.degrees > CERTIFIED:
-        return _with_model_error(fit, assessment, band)
-    return fit, assessment
+    fit = model.fit(path, low.time, spline, smooth=smooth)
+    return _simplest(model, fit, model.assess(fit))
 
 
 def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
