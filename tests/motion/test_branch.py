@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from trapcli.motion.branch import Evidence, Hypothesis, _distinct, find_branches
+from trapcli.motion.branch import Evidence, Hypothesis, distinct, find_branches
 from trapcli.motion.centers import Centers
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.low_band import read_low_band
@@ -152,8 +152,8 @@ def test_hypotheses_are_distinct_and_sorted(tumbling: Scene) -> None:
     costs = [10.0, 11.0, 12.0, 13.0]
     hypotheses = [Hypothesis(p, c, 1.0, 1.0) for p, c in zip(paths, costs, strict=True)]
     hypotheses.append(Hypothesis(path, 1000.0, 1.0, 1.0))
-    assert [h.cost for h in _distinct(hypotheses[::-1], 6)] == [10.0, 12.0]
-    assert [h.cost for h in _distinct(hypotheses, 1)] == [10.0]
+    assert [h.cost for h in distinct(hypotheses[::-1], 6)] == [10.0, 12.0]
+    assert [h.cost for h in distinct(hypotheses, 1)] == [10.0]
 
 
 @pytest.mark.parametrize("name", ["tumbling", "single_axis"])

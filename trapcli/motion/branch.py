@@ -197,12 +197,25 @@ def find_branches(
                 grown += wider.refine([path], _spline(wider.time, groups_per_knot), 12)
             else:
                 grown.append(wider.judge(_refine_ends(wider, path, groups_per_knot)))
-        hypotheses = _distinct(grown, keep)
+        hypotheses = distinct(grown, keep)
         low, high = new_low, new_high
         refined = length if whole else refined
     if progress is not None:
         progress("branches", groups, groups)
     return hypotheses
+
+
+def distinct(hypotheses: list[Hypothesis], keep: int) -> list[Hypothesis]:
+    """Return the best hypotheses that differ by more than gauge and mirror and are not hopeless."""
+    kept: list[Hypothesis] = []
+    for h in sorted(hypotheses, key=lambda h: h.cost):
+        if kept and h.cost > 1.5 * kept[0].cost + 20:
+            break
+        if all(align(h.path.R, other.path.R)[0].mean() > _DISTINCT for other in kept):
+            kept.append(h)
+        if len(kept) == keep:
+            break
+    return kept
 
 
 def _spline(time: Array, groups_per_knot: int) -> Spline:
@@ -236,7 +249,7 @@ def _first_window(evidence: Evidence, starts: int, keep: int) -> list[Hypothesis
         omega = axis / np.linalg.norm(axis) * rng.uniform(_SLOWEST, _FASTEST) / span
         paths.append(Path.constant(time, omega))
     rough = evidence.refine(paths, line, 8)
-    return _distinct(evidence.refine([h.path for h in rough], curve, 8), keep)
+    return distinct(evidence.refine([h.path for h in rough], curve, 8), keep)
 
 
 def _together(paths: list[Path]) -> Path:
@@ -251,16 +264,3 @@ def _damped_step(hessian: Array, gradient: Array, damping: Array) -> Array:
     damped = hessian + ridge[..., None] * np.eye(diagonal.shape[-1])
     step = np.linalg.solve(damped, gradient[..., None])
     return np.asarray(step.reshape(*gradient.shape[:-1], -1, 3))
-
-
-def _distinct(hypotheses: list[Hypothesis], keep: int) -> list[Hypothesis]:
-    """Return the best hypotheses that differ by more than gauge and mirror and are not hopeless."""
-    kept: list[Hypothesis] = []
-    for h in sorted(hypotheses, key=lambda h: h.cost):
-        if kept and h.cost > 1.5 * kept[0].cost + 20:
-            break
-        if all(align(h.path.R, other.path.R)[0].mean() > _DISTINCT for other in kept):
-            kept.append(h)
-        if len(kept) == keep:
-            break
-    return kept

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
 from trapcli.motion.ambiguity import unseen_turn
-from trapcli.motion.branch import Evidence, Hypothesis, find_branches
+from trapcli.motion.branch import Evidence, Hypothesis, distinct, find_branches
 from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
@@ -58,9 +58,10 @@ _ATTEMPTS = (
 )  # first window [groups] and where it lies
 _FITS = 1.5  # misfit per degree of freedom of lines and moments at which no other window is tried
 _LIKELY = 1.3  # cost, in units of the best's, up to which a hypothesis is looked into further
-_MOST_HYPOTHESES = 8  # of them at most
+_MOST_HYPOTHESES = 2, 16  # of them at most, of the first window that fits and of all
 _RIVAL = 1.1  # misfit of a coarse model, in units of the best's, up to which a fine one is fitted as well
-_MOST_REFINED = 2  # of them at most
+_MOST_REFINED = 2, 4  # of them at most
+_FIRST_STEPS = 6  # of the first fit: a motion that is not found by then is none
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
@@ -145,37 +146,36 @@ def _best_motion(
     fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
     size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
     _, low = _grouped(stack, used, size)
-    known: list[Fit] = []
-    best: tuple[Fit, Assessment] | None = None
-    for hypotheses in _hypotheses(stack, used, pace, progress):
+    coarse: list[Fit] = []
+    tried: list[Fit] = []
+    fine_fits: list[tuple[Fit, Assessment]] = []
+    for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
-        coarse = _coarse_fits(hypotheses, low, stack.low.time, band, knots)
-        new = _distinct(coarse, known)[:_MOST_REFINED]
-        known += new
-        fits = [_fine_fit(fit, low, band, smooth=not knots) for fit in new]
-        best = min([*fits, *([best] if best else [])], key=lambda one: one[0].cost - one[1].degrees)
-        if _settled(*best, len(stack.low.time)):
+        coarse += _coarse_fits(hypotheses, low, stack.low.time, band, knots)
+        new = [fit for fit in _rivals(coarse)[:most] if not any(fit is other for other in tried)]
+        tried += new
+        fine_fits += [_fine_fit(fit, low, band, smooth=not knots) for fit in new]
+        fit, assessment = min(fine_fits, key=lambda fitted: fitted[0].cost - fitted[1].degrees)
+        if _settled(fit, assessment, len(stack.low.time)):
             break
-    assert best is not None
-    fit, assessment = best
     if fit.cost / assessment.degrees > CERTIFIED:
         return _with_model_error(fit, assessment, band)
-    return best
+    return fit, assessment
 
 
-def _distinct(fits: list[Fit], known: list[Fit]) -> list[Fit]:
-    """Return the fits that come near to the best of all, best first, each of a motion of its own."""
+def _rivals(fits: list[Fit]) -> list[Fit]:
+    """Return the best fit and what comes near to it with a motion of its own."""
 
-    def differ(fit: Fit, other: Fit) -> bool:
+    def alike(fit: Fit, other: Fit) -> bool:
         R, other_R = (f.path.R[-len(f.low.time) :] for f in (fit, other))
-        return bool(align(R, other_R)[0].mean() > _SAME)
+        return bool(align(R, other_R)[0].mean() <= _SAME)
 
-    least = min(fit.cost for fit in (*fits, *known))
-    new: list[Fit] = []
-    for fit in sorted(fits, key=lambda fit: fit.cost):
-        if fit.cost <= _RIVAL * least and all(differ(fit, other) for other in (*known, *new)):
-            new.append(fit)
-    return new
+    ordered = sorted(fits, key=lambda fit: fit.cost)
+    chosen: list[Fit] = []
+    for fit in ordered:
+        if fit.cost <= _RIVAL * ordered[0].cost and not any(alike(fit, other) for other in chosen):
+            chosen.append(fit)
+    return chosen
 
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
@@ -241,21 +241,20 @@ def _hypotheses(
     size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
     reduced, low = _grouped(stack, used, size)
     evidence = Evidence(low.time, LineTable(reduced, _LINE_ERROR), MomentTable(low, _MOMENT_ERROR))
-    waiting: list[Hypothesis] = []
+    found: list[Hypothesis] = []
     yielded: list[Hypothesis] = []
     for attempt, (window, middle) in enumerate(_ATTEMPTS):
-        tried = replace(evidence, seed=attempt)
-        for path in (h.path for h in find_branches(tried, window=window, middle=middle, progress=progress)):
-            if all(align(path.R, h.path.R)[0].mean() > _SAME for h in (*yielded, *waiting)):
-                waiting.append(evidence.judge(path))
-        waiting.sort(key=lambda h: h.cost)
-        fits = waiting and waiting[0].lines < _FITS and waiting[0].moments < _FITS
-        if waiting and (attempt == len(_ATTEMPTS) - 1 or (fits and not yielded)):
-            most = _MOST_HYPOTHESES if yielded else _MOST_REFINED
-            chosen = [h for h in waiting[:most] if h.cost <= _LIKELY * waiting[0].cost]
-            yield chosen
-            yielded += chosen
-            waiting = []
+        last, tried = attempt == len(_ATTEMPTS) - 1, replace(evidence, seed=attempt)
+        branches = find_branches(tried, window=window, middle=middle, progress=progress)
+        found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_HYPOTHESES[1])
+        fits = found[0].lines < _FITS and found[0].moments < _FITS
+        if last or (fits and not yielded):
+            most = _MOST_HYPOTHESES[1 if yielded else 0]
+            likely = [h for h in found[:most] if h.cost <= _LIKELY * found[0].cost]
+            new = [h for h in likely if not any(h is other for other in yielded)]
+            yielded += new
+            if new:
+                yield new
 
 
 def _coarse_fits(
@@ -274,7 +273,7 @@ def _coarse_fits(
         if knots:
             rough = fine = Spline(time[0], time[-1], knots)
         near = path.near(rough, np.concatenate([time, fine.grid, low.time]))
-        first.append(model.fit(near, low.time, rough, smooth=False))
+        first.append(model.fit(near, low.time, rough, smooth=False, steps=_FIRST_STEPS))
         finer.append(fine)
     if knots:
         return first
