@@ -101,6 +101,13 @@ def test_another_type_of_pixel(paper_frames) -> None:  # type: ignore[no-untyped
     assert np.abs(centers_of(counts, 0.2).center - true).max() < 1e-4
 
 
+def test_noise_of_small_frames_is_told_to_two_percent() -> None:
+    rng = np.random.default_rng(0)
+    told = [pixel_noise(rng.standard_normal((20, 64, 64))) for _ in range(40)]
+    assert np.mean(told) == pytest.approx(1.0, abs=0.01)
+    assert np.std(told) < 0.02
+
+
 def test_noise_and_radius_of_a_ball() -> None:
     rng = np.random.default_rng(2)
     rows, columns = np.mgrid[:128, :128] - 64
