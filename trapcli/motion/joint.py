@@ -152,7 +152,7 @@ def _best_motion(
     for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
         coarse += _coarse_fits(hypotheses, low, stack.low.time, band, knots)
-        new = [fit for fit in _rivals(coarse)[:most] if not any(fit is other for other in tried)]
+        new = [fit for fit in _rivals(coarse)[:most] if not any(_repeats(fit, other) for other in tried)]
         tried += new
         fine_fits += [_fine_fit(fit, low, band, smooth=not knots) for fit in new]
         fit, assessment = min(fine_fits, key=lambda fitted: fitted[0].cost - fitted[1].degrees)
@@ -165,17 +165,19 @@ def _best_motion(
 
 def _rivals(fits: list[Fit]) -> list[Fit]:
     """Return the best fit and what comes near to it with a motion of its own."""
-
-    def alike(fit: Fit, other: Fit) -> bool:
-        R, other_R = (f.path.R[-len(f.low.time) :] for f in (fit, other))
-        return bool(align(R, other_R)[0].mean() <= _SAME)
-
     ordered = sorted(fits, key=lambda fit: fit.cost)
     chosen: list[Fit] = []
     for fit in ordered:
-        if fit.cost <= _RIVAL * ordered[0].cost and not any(alike(fit, other) for other in chosen):
+        if fit.cost <= _RIVAL * ordered[0].cost and not any(_repeats(fit, other) for other in chosen):
             chosen.append(fit)
     return chosen
+
+
+def _repeats(one: Fit | Hypothesis, other: Fit | Hypothesis) -> bool:
+    """Tell whether a motion is that of another one, whose misfit is about as low or lower."""
+    # a fit's path holds other times as well, the groups' last
+    R, other_R = (m.path.R[-len(m.low.time) :] if isinstance(m, Fit) else m.path.R for m in (one, other))
+    return bool(other.cost <= _RIVAL * one.cost and align(R, other_R)[0].mean() <= _SAME)
 
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
@@ -251,7 +253,7 @@ def _hypotheses(
         if last or (fits and not yielded):
             most = _MOST_HYPOTHESES[1 if yielded else 0]
             likely = [h for h in found[:most] if h.cost <= _LIKELY * found[0].cost]
-            new = [h for h in likely if not any(h is other for other in yielded)]
+            new = [h for h in likely if not any(_repeats(h, other) for other in yielded)]
             yielded += new
             if new:
                 yield new
