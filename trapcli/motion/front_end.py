@@ -144,9 +144,9 @@ def _look(attenuation: Frames) -> _Look:
     coarse: list[Array] = []
     wanted = spread(len(attenuation), _SURVEY)
     pairs = spread(len(attenuation), few) if few > len(wanted) else wanted[spread(len(wanted), few)]
-    both = np.union1d(wanted, np.minimum(pairs + 1, len(attenuation) - 1))
+    every = np.unique(np.concatenate([wanted, pairs, np.minimum(pairs + 1, len(attenuation) - 1)]))
     first, last = np.empty(0), -2
-    for position, image in zip(both, attenuation.pick(both), strict=True):
+    for position, image in zip(every, attenuation.pick(every), strict=True):
         averaged = cells.average(image)
         if not np.isfinite(averaged).all():
             continue
