@@ -270,3 +270,12 @@ def test_a_motion_that_the_first_window_misses() -> None:
     found = estimate(images, truth.time)
     assert found.identifiable
     assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 1.5
+
+
+@pytest.mark.slow
+def test_a_long_noisy_stack() -> None:
+    """Three turns at 5 % noise: what a path has gone through keeps its ends from going astray."""
+    images, truth = render("tumbling", "blobs", 5, frames=600, pixels=64, noise=0.05, total_angle=1080.0)
+    found = estimate(images, truth.time)
+    assert found.identifiable
+    assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 0.5
