@@ -148,19 +148,22 @@ def _best_motion(
     _, low = _grouped(stack, used, size)
     coarse: list[Fit] = []
     tried: list[Fit] = []
-    fine_fits: list[tuple[Fit, Assessment]] = []
+    best: tuple[Fit, Assessment] | None = None
     for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
         coarse += _coarse_fits(hypotheses, low, stack.low.time, band, knots)
         new = [fit for fit in _rivals(coarse)[:most] if not any(_repeats(fit, other) for other in tried)]
         tried += new
-        fine_fits += [_fine_fit(fit, low, band, smooth=not knots) for fit in new]
-        fit, assessment = min(fine_fits, key=lambda fitted: fitted[0].cost - fitted[1].degrees)
-        if _settled(fit, assessment, len(stack.low.time)):
+        for rival in new:
+            fitted = _fine_fit(rival, low, band, smooth=not knots)
+            best = min(best or fitted, fitted, key=lambda one: one[0].cost - one[1].degrees)
+        if best is not None and _settled(*best, len(stack.low.time)):
             break
+    assert best is not None
+    fit, assessment = best
     if fit.cost / assessment.degrees > CERTIFIED:
         return _with_model_error(fit, assessment, band)
-    return fit, assessment
+    return best
 
 
 def _rivals(fits: list[Fit]) -> list[Fit]:
@@ -263,6 +266,10 @@ def _coarse_fits(
     hypotheses: list[Hypothesis], low: LowBand, time: Array, band: float, knots: int
 ) -> list[Fit]:
     """Fit a coarse object model along hypotheses, with as many knots as turns may need where it pays."""
+
+    def light(fit: Fit) -> Fit:
+        return replace(fit, known=None)  # normal equations of many motions would take much memory
+
     model = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
     first: list[Fit] = []
     finer: list[Spline] = []
@@ -275,13 +282,13 @@ def _coarse_fits(
         if knots:
             rough = fine = Spline(time[0], time[-1], knots)
         near = path.near(rough, np.concatenate([time, fine.grid, low.time]))
-        first.append(model.fit(near, low.time, rough, smooth=False, steps=_FIRST_STEPS))
+        first.append(light(model.fit(near, low.time, rough, smooth=False, steps=_FIRST_STEPS)))
         finer.append(fine)
     if knots:
         return first
     least = min(fit.cost for fit in first)
     return [
-        model.fit(fit.path, low.time, spline)
+        light(model.fit(fit.path, low.time, spline))
         for fit, spline in zip(first, finer, strict=True)
         if fit.cost <= _LIKELY * least
     ]
