@@ -195,7 +195,8 @@ def pixel_noise(images: NDArray[Any]) -> float:
     """
     if not len(images) or min(images.shape[1:]) < 4:
         return 0.0
-    return max(_corner_noise(images), _uncut_noise(images))
+    # what the rim of a frame holds of a background stays out of the corners
+    return max(_corner_noise(images, np.hanning), _uncut_noise(images))
 
 
 def noise_between(image: NDArray[Any], following: NDArray[Any]) -> float:
@@ -212,7 +213,7 @@ def noise_between(image: NDArray[Any], following: NDArray[Any]) -> float:
     change = (following - image) / np.sqrt(2).astype(image.dtype)
     if not _rim_noise(change) > _INDEPENDENT * _rim_noise(image):
         return pixel_noise(image[None])
-    return max(_corner_noise(change[None]), _uncut_noise(image[None]))
+    return max(_corner_noise(change[None], _taper), _uncut_noise(image[None]))
 
 
 def _rim_noise(image: NDArray[Any]) -> float:
@@ -223,11 +224,11 @@ def _rim_noise(image: NDArray[Any]) -> float:
     return float(np.median(np.concatenate(sharp)))
 
 
-def _corner_noise(images: NDArray[Any]) -> float:
+def _corner_noise(images: NDArray[Any], taper: Callable[[int], Array]) -> float:
     k2 = np.abs(np.fft.fftfreq(images.shape[1], 0.5))[:, None]
     k1 = np.abs(np.fft.rfftfreq(images.shape[2], 0.5))
     corner = np.minimum(k1, k2) > 0.7
-    window = _taper(images.shape[1])[:, None] * _taper(images.shape[2])
+    window = taper(images.shape[1])[:, None] * taper(images.shape[2])
     powers = [_faint_mean(np.abs(rfft2(image * window)[corner]) ** 2) / np.sum(window**2) for image in images]
     return float(np.sqrt(np.median(powers)))
 
