@@ -541,15 +541,17 @@ class ObjectModel:
     def _noise_hessian(self, views: _Views, state: _State, eliminated: Eliminated, values: Array) -> Array:
         """Return the ``(P, P)`` mean normal matrix of a motion of objects that are fitted to noise alone."""
         rng = np.random.default_rng(0)
-        every: list[ComplexArray] = []
-        for _ in range(_PROBES):
+
+        def probe() -> ComplexArray:
+            """Return the ``(G, K, 3)`` slopes by rotation of an object that is fitted to noise."""
             real, imaginary = rng.standard_normal((2, *self._root.shape))
             # a mode that stands for itself alone is real
             noise = real + 1j * (self._share > 1) * imaginary
             _, slopes = self._model(views.R, views.points, views.solve(self._right(views, noise)))
             turns = slopes[..., :3] * self._root[..., None]
-            every.append(_without_shifts(turns, state.slopes[..., 3:], eliminated.shift_covariance)[1])
-        alone = np.concatenate(every, axis=-1)
+            return _without_shifts(turns, state.slopes[..., 3:], eliminated.shift_covariance)[1]
+
+        alone = np.concatenate([probe() for _ in range(_PROBES)], axis=-1)
         coupling = np.zeros((values.shape[1], len(self.position), alone.shape[-1]))
         for part, column in self._columns(views, alone):
             _add_bent(coupling, values[part], column)
