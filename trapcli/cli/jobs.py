@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from trapcli.config import GUESSED_BACKGROUNDS, EstimateConfig, to_toml
 from trapcli.errors import InputError, OutputError, TrapError
+from trapcli.threads import share_memory
 
 if TYPE_CHECKING:
     from trapcli.result.motion import Motion
@@ -104,6 +105,7 @@ def _is_written(job: Job) -> bool:
 def _estimate(job: Job, progress: Callable[[str, int, int], None] | None) -> Outcome:
     from trapcli.stack import open_stack
 
+    share_memory()
     frames = open_stack(job.source, job.config.input)
     with _checksums(job, frames) as checksums:
         from trapcli.pipeline import estimate  # takes a while: checksums are taken meanwhile

@@ -12,7 +12,6 @@ import click
 
 from trapcli.cli.options import say
 from trapcli.errors import ConfigError, OutputError, TrapError
-from trapcli.threads import share_memory
 
 COMMANDS = ("simulate", "estimate", "compare", "plot", "report", "reconstruct", "align", "export", "info")
 FAULT = 1
@@ -46,7 +45,6 @@ def run(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     # our matrices are small and many: threads that share one spend most of their time waiting for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    share_memory()
     try:
         code: Any = cli.main(args=arguments, prog_name="trap-motion", standalone_mode=False)
         if sys.stdout:

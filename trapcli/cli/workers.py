@@ -21,7 +21,6 @@ from typing import Any
 
 from trapcli.cli.options import Console
 from trapcli.errors import ConfigError
-from trapcli.threads import share_memory
 
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?[\w.\-\[\]:%]+:\d+")
 _PATIENCE = 10
@@ -150,7 +149,6 @@ def _serve(connection: Connection, threads: int) -> None:
         signal.signal(signal.SIGTERM, interrupt)
         # read when the numerical libraries are loaded, by `work`
         os.environ.setdefault("OMP_NUM_THREADS", str(threads))
-        share_memory()
         while True:
             work, items, named = connection.recv()
             connection.send(work(*items, **named))

@@ -97,7 +97,7 @@ def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | N
     UnseenTurn or None
         None where the images tell the motion from all others that were tried.
     """
-    R = fit.path.R[-len(fit.low.time) :]
+    R = fit.R
     low = fit.low.shifted(np.einsum("gji,j->gi", R, assessment.middle)[:, :2])
     centred = replace(fit, low=low)
     # what the lower half of the band tells apart needs no finer look
@@ -115,9 +115,10 @@ def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | N
 def _least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:
     """Return ``(3, 3)`` axes of the object as rows, that of the spin which changes the misfit least first."""
     values = fit.spline.values(fit.low.time)
-    R = fit.path.R[-len(values) :]
     ramp = np.linspace(-0.5, 0.5, len(values))
-    spins = [np.linalg.lstsq(values, ramp[:, None] * R[:, axis], rcond=None)[0].ravel() for axis in range(3)]
+    spins = [
+        np.linalg.lstsq(values, ramp[:, None] * fit.R[:, axis], rcond=None)[0].ravel() for axis in range(3)
+    ]
     size = values.shape[1]
     known = np.linalg.pinv(assessment.covariance.reshape(3 * size, 3 * size), rcond=1e-12, hermitian=True)
     _, axes = np.linalg.eigh(np.array(spins) @ known @ np.transpose(spins))
@@ -158,7 +159,7 @@ def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTur
     factors = [factor for factor in _SYMMETRY_FACTORS if abs(factor - 1) * turned > _LEAST]
     others = [_spun(fit.path, axis, float(factor - 1) * (angle - angle.mean())) for factor in factors]
     groups = len(fit.low.time)
-    own = coarse.cost(fit.path.R[-groups:], coarse.low.modes)
+    own = coarse.cost(fit.R, coarse.low.modes)
     rise = np.array([coarse.cost(other.R[-groups:], coarse.low.modes) - own for other in others])
     found, noise = [Fraction(1)], _BEST_OF_MANY * fit.spline.size
     for i in np.argsort(rise)[:_MOST_RIVALS]:

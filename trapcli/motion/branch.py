@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,10 @@ from trapcli.motion.path import Path, Spline, align, orthonormal
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
+DISTINCT = np.deg2rad(3.0)
+"""Mean angle beyond which two motions differ by more than gauge and mirror."""
+
 _PAIRS = 12  # pairs of frames a frame
-_DISTINCT = np.deg2rad(3.0)  # mean angle between paths that are hypotheses of their own
 _REACH = 10  # groups added at each end at a time
 _SHORT = 480  # groups up to which every refinement takes the whole path
 _GROWTH = 1.4  # growth of a longer path after which the whole is refined again
@@ -41,6 +44,26 @@ class Hypothesis:
     cost: float
     lines: float
     moments: float
+
+    @property
+    def R(self) -> Array:
+        """``(G, 3, 3)`` rotations of the groups."""
+        return self.path.R
+
+
+class Candidate(Protocol):
+    """A motion of G groups of frames, and its misfit."""
+
+    @property
+    def R(self) -> Array:
+        """``(G, 3, 3)`` rotations of the groups."""
+
+    @property
+    def cost(self) -> float:
+        """Misfit to the data."""
+
+
+C = TypeVar("C", bound=Candidate)
 
 
 @dataclass(frozen=True)
@@ -205,14 +228,14 @@ def find_branches(
     return hypotheses
 
 
-def distinct(hypotheses: list[Hypothesis], keep: int) -> list[Hypothesis]:
-    """Return the best hypotheses that differ by more than gauge and mirror and are not hopeless."""
-    kept: list[Hypothesis] = []
-    for h in sorted(hypotheses, key=lambda h: h.cost):
-        if kept and h.cost > 1.5 * kept[0].cost + 20:
+def distinct(candidates: list[C], keep: int) -> list[C]:
+    """Return the best motions that differ by more than gauge and mirror and are not hopeless."""
+    kept: list[C] = []
+    for c in sorted(candidates, key=lambda c: c.cost):
+        if kept and c.cost > 1.5 * kept[0].cost + 20:
             break
-        if all(align(h.path.R, other.path.R)[0].mean() > _DISTINCT for other in kept):
-            kept.append(h)
+        if all(align(c.R, other.R)[0].mean() > DISTINCT for other in kept):
+            kept.append(c)
         if len(kept) == keep:
             break
     return kept

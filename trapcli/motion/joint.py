@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
 from trapcli.motion.ambiguity import unseen_turn
-from trapcli.motion.branch import Evidence, Hypothesis, distinct, find_branches
+from trapcli.motion.branch import DISTINCT, Candidate, Evidence, Hypothesis, distinct, find_branches
 from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
@@ -56,7 +56,7 @@ _ATTEMPTS = (
     (50, 0.85),
     (120, 0.5),
 )  # first window [groups] and where it lies
-_FITS = 1.5  # misfit per degree of freedom of lines and moments at which no other window is tried
+_FITS = 1.5  # misfit per degree of freedom of lines and moments up to which one window will do at first
 _LIKELY = 1.3  # cost, in units of the best's, up to which a hypothesis is looked into further
 _MOST_HYPOTHESES = 2, 16  # of them at most, of the first window that fits and of all
 _RIVAL = 1.1  # misfit of a coarse model, in units of the best's, up to which a fine one is fitted as well
@@ -67,7 +67,6 @@ _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is w
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
-_SAME = np.deg2rad(3.0)  # mean angle below which two hypotheses are one
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
@@ -152,7 +151,9 @@ def _best_motion(
     for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
         coarse += _coarse_fits(hypotheses, low, stack.low.time, band, knots)
-        new = [fit for fit in _rivals(coarse)[:most] if not any(_repeats(fit, other) for other in tried)]
+        rivals = distinct(coarse, most)
+        near = [fit for fit in rivals if fit.cost <= _RIVAL * rivals[0].cost]
+        new = [fit for fit in near if not any(_repeats(fit, other) for other in tried)]
         tried += new
         for rival in new:
             fitted = _fine_fit(rival, low, band, smooth=not knots)
@@ -166,21 +167,9 @@ def _best_motion(
     return best
 
 
-def _rivals(fits: list[Fit]) -> list[Fit]:
-    """Return the best fit and what comes near to it with a motion of its own."""
-    ordered = sorted(fits, key=lambda fit: fit.cost)
-    chosen: list[Fit] = []
-    for fit in ordered:
-        if fit.cost <= _RIVAL * ordered[0].cost and not any(_repeats(fit, other) for other in chosen):
-            chosen.append(fit)
-    return chosen
-
-
-def _repeats(one: Fit | Hypothesis, other: Fit | Hypothesis) -> bool:
+def _repeats(one: Candidate, other: Candidate) -> bool:
     """Tell whether a motion is that of another one, whose misfit is about as low or lower."""
-    # a fit's path holds other times as well, the groups' last
-    R, other_R = (m.path.R[-len(m.low.time) :] if isinstance(m, Fit) else m.path.R for m in (one, other))
-    return bool(other.cost <= _RIVAL * one.cost and align(R, other_R)[0].mean() <= _SAME)
+    return bool(other.cost <= _RIVAL * one.cost and align(one.R, other.R)[0].mean() <= DISTINCT)
 
 
 def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
@@ -296,9 +285,8 @@ def _coarse_fits(
 
 def _fine_fit(coarse: Fit, low: LowBand, band: float, *, smooth: bool) -> tuple[Fit, Assessment]:
     """Go on with as fine an object model as the frames pay for, and judge the motion by it."""
-    path, spline = coarse.path, coarse.spline
-    model = ObjectModel.simplest(low, band, path.R[-len(low.time) :])
-    fit = model.fit(path, low.time, spline, smooth=smooth)
+    model = ObjectModel.simplest(low, band, coarse.R)
+    fit = model.fit(coarse.path, low.time, coarse.spline, smooth=smooth)
     return _simplest(model, fit, model.assess(fit))
 
 

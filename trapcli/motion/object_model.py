@@ -93,6 +93,11 @@ class Fit:
     model: ObjectModel
     known: Normal | None = None
 
+    @property
+    def R(self) -> Array:
+        """``(G, 3, 3)`` rotations of the groups."""
+        return self.path.R[-len(self.low.time) :]
+
     @cached_property
     def normal(self) -> Normal:
         """The model's normal equations at the motion."""
@@ -316,7 +321,7 @@ class ObjectModel:
     def normal(self, fit: Fit) -> Normal:
         """Return the normal equations at a fit of this model."""
         values = fit.spline.values(fit.low.time)
-        views = self._views(fit.path.R[-len(values) :])
+        views = self._views(fit.R)
         state = self._state(views, fit.low.modes)
         eliminated = self._eliminated(views, state, values)
         return Normal(views, state, eliminated, self._noise_hessian(views, state, eliminated, values))
