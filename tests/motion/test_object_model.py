@@ -102,7 +102,7 @@ def test_the_gradient_is_half_the_slope_downhill(thing: Blobs, path: Path) -> No
     model = ObjectModel(low, BAND, weights=np.linspace(0.5, 1, FRAMES))
     rng = np.random.default_rng(0)
     R, h = turned(path.R, rng.normal(scale=0.05, size=(FRAMES, 3))), 1e-5
-    state = model._state(model._views(R), low.modes)
+    state = model._state(model.views(R), low.modes)
     gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
     assert model.cost(R, low.modes) == pytest.approx(state.cost)
     for _ in range(2):
@@ -124,7 +124,7 @@ def test_misfit_and_what_the_frames_see_do_not_favour_a_motion(path: Path) -> No
         noise[:, 0] = sigma * rng.normal(size=FRAMES)
     biases = []
     for R in (path.R, np.tile(np.eye(3), (FRAMES, 1, 1))):
-        views = model._views(R)
+        views = model.views(R)
         costs = [model._cost(views, noise) for noise in noises]
         tolerance = 4 * np.sqrt(2 * model.data_count / len(noises))
         assert np.mean(costs) + views.seen == pytest.approx(model.data_count, abs=tolerance)
@@ -135,9 +135,9 @@ def test_misfit_and_what_the_frames_see_do_not_favour_a_motion(path: Path) -> No
 def test_the_slopes_of_what_the_frames_see(thing: Blobs, path: Path) -> None:
     low = low_band(thing, path, 3, noise=0.05)
     model = ObjectModel(low, BAND, weights=np.linspace(0.5, 1, FRAMES))
-    slopes, h = model._seen_slopes(model._views(path.R)), 3e-5
+    slopes, h = model._seen_slopes(model.views(path.R)), 3e-5
     turn = np.random.default_rng(0).normal(size=(FRAMES, 3))
-    after, before = (model._views(turned(path.R, sign * h * turn)).seen for sign in (1, -1))
+    after, before = (model.views(turned(path.R, sign * h * turn)).seen for sign in (1, -1))
     assert (after - before) / (2 * h) == pytest.approx(np.sum(slopes * turn), rel=1e-5)
 
 
@@ -147,7 +147,7 @@ def test_the_hessian_has_object_and_shifts_eliminated(thing: Blobs, path: Path) 
     path = Path(path.time[few], path.R[few], path.omega[few])
     low, values = low_band(thing, path, 1, band=band), Spline(0.0, 1.0, 1).values(path.time)
     model = ObjectModel(low, band)
-    views = model._views(path.R)
+    views = model.views(path.R)
     state = model._state(views, low.modes)
     found = model._eliminated(views, state, values).hessian
 

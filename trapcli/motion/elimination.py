@@ -30,18 +30,22 @@ class ObjectBlock:
 
     Parameters
     ----------
-    blocks, factors:
-        N, block-diagonal, n × n in all, and lower Cholesky factors of its blocks.
+    halves:
+        Inverses of the lower Cholesky factors of N's diagonal blocks, n × n in all.
     parts:
         S in parts of ``(n, any)`` columns.
     count:
         Columns of S in all.
+    blocks:
+        The blocks themselves, where `is_dense`.
     """
 
-    def __init__(self, blocks: list[Array], factors: list[Array], parts: Iterable[Array], count: int) -> None:
+    def __init__(
+        self, halves: list[Array], parts: Iterable[Array], count: int, blocks: list[Array] | None = None
+    ) -> None:
         self._rest: Array | None = None
-        if count < sum(len(block) for block in blocks):
-            self._factors = factors
+        if blocks is None:
+            self._halves = halves
             self._leaning = self._forward(np.concatenate(list(parts), axis=1))
             rest = np.eye(count) - self._leaning.T @ self._leaning
             # a shift of all frames that the object follows leaves nothing but the object's own prior
@@ -51,7 +55,13 @@ class ObjectBlock:
         reduced = np.asfortranarray(scipy.linalg.block_diag(*blocks))
         for part in parts:
             reduced = scipy.linalg.blas.dsyrk(-1.0, part, 1.0, reduced, lower=True, overwrite_c=True)
-        self._factors = [scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)]
+        factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
+        self._halves = [scipy.linalg.lapack.dtrtri(factor, lower=True, overwrite_c=True)[0]]
+
+    @staticmethod
+    def is_dense(n: int, count: int) -> bool:
+        """Tell whether n amplitudes are fewer than `count` shifts."""
+        return n <= count
 
     def solve(self, right: Array) -> Array:
         """Return ``(n, C)`` (N − S Sᵀ)⁻¹ times ``(n, C)`` columns."""
@@ -60,22 +70,18 @@ class ObjectBlock:
             half += self._leaning @ scipy.linalg.cho_solve(
                 (self._rest, True), self._leaning.T @ half, check_finite=False
             )
-        return self._triangular(half, transposed=True)
+        return self._multiplied(half, transposed=True)
 
     def _forward(self, right: Array) -> Array:
-        return self._triangular(right, transposed=False)
+        return self._multiplied(right, transposed=False)
 
-    def _triangular(self, right: Array, transposed: bool) -> Array:
-        ends = np.cumsum([len(factor) for factor in self._factors])[:-1]
+    def _multiplied(self, right: Array, transposed: bool) -> Array:
+        ends = np.cumsum([len(half) for half in self._halves])[:-1]
 
-        def solved(factor: Array, part: Array) -> Array:
-            return np.asarray(
-                scipy.linalg.solve_triangular(
-                    factor, part, lower=True, trans=int(transposed), check_finite=False
-                )
-            )
+        def product(half: Array, part: Array) -> Array:
+            return np.asarray(scipy.linalg.blas.dtrmm(1.0, half, part, lower=True, trans_a=transposed))
 
-        return np.concatenate(in_parallel(solved, self._factors, np.split(right, ends)))
+        return np.concatenate(in_parallel(product, self._halves, np.split(right, ends)))
 
 
 @dataclass(frozen=True)

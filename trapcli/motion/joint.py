@@ -43,7 +43,10 @@ Bools = NDArray[np.bool_]
 _FEWEST = 12  # frames
 _LINE_BAND = 8.0  # band times radius for common lines
 _COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
-_FINE_BAND = 22.0  # band times radius of the object model in the end
+_FINE_BAND = 22.0  # band times radius of the object model that tells motions apart
+_FINEST_BAND = 28.0  # the same at most in the end, where the object is as sharp as that
+_TOLD = 5.0  # signal over noise of the object's finest parts, from all frames, up to which they help
+_WORTHWHILE = 0.05  # share in what tells the motion that makes a wider band worth its time
 _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
 _FINE_GROUP = np.deg2rad(1.0)  # the same, to refine it, at noise of 1 % of the peak
 _FEWEST_GROUPS = 30
@@ -110,7 +113,7 @@ def estimate_joint(
         time=time,
         pixel_size=pixel_size,
         line_band=_LINE_BAND,
-        fine_band=_FINE_BAND,
+        fine_band=_FINEST_BAND,
         band=config.band,
         progress=progress,
     )
@@ -120,7 +123,6 @@ def estimate_joint(
         raise InputError(
             f"{attenuation.info.source}: {seen.sum()} frames show an object; at least {_FEWEST} are needed"
         )
-    fine_band = config.band or _FINE_BAND / centers.radius
     outlying = np.zeros(len(time), bool)
     outlying[seen] = _outliers(low.select(np.flatnonzero(seen)))
     stack = Stack(reduced, low, centers, seen, outlying, attenuation.index)
@@ -132,16 +134,41 @@ def estimate_joint(
             "nothing changes between the frames beyond the noise: the object is still, "
             "or turns about an axis of symmetry; no rotation can be told",
         )
-    fit, assessment = _best_motion(stack, used, pace, fine_band, config.knots, progress)
+    bands = (config.band, config.band) if config.band else _bands(low.select(used))
+    fit, assessment = _best_motion(stack, used, pace, bands, config.knots, progress)
     verdict = judge(fit, assessment)
-    unseen = unseen_turn(fit, assessment, fine_band) if verdict.identifiable else None
+    unseen = unseen_turn(fit, assessment, bands[0]) if verdict.identifiable else None
     return to_motion(stack, fit, assessment, verdict, unseen)
 
 
+def _bands(low: LowBand) -> tuple[float, float]:
+    """Return the bands of the object model that tells motions apart and of the last [rad / length].
+
+    A part of the object at k is seen by those frames whose slice passes within half its width, π / radius.
+    Where all of them together leave it in the noise, it tells nothing of the motion.
+    """
+    radial = low.radius * np.hypot(low.k[:, 0], low.k[:, 1])
+    power = np.mean(np.abs(low.modes) ** 2, axis=0) / low.variance - 1
+    ring = np.arange(_COARSE_BAND, _FINEST_BAND, 1.0)
+    told = np.array([power[np.abs(radial - middle) <= 1.0].mean() for middle in ring])
+    told *= len(low.modes) * np.pi / 2 / ring
+    last = ring[told > _TOLD].max(initial=_COARSE_BAND) + 1.0
+    telling = radial**2 * np.maximum(power, 0.0)  # how much a small turn changes, in units of the noise
+    finer = telling[(radial > _FINE_BAND) & (radial <= last)].sum() > _WORTHWHILE * telling.sum()
+    first = min(last, _FINE_BAND)
+    return first / low.radius, (last if finer else first) / low.radius
+
+
 def _best_motion(
-    stack: Stack, used: NDArray[np.intp], pace: float, band: float, knots: int, progress: Progress | None
+    stack: Stack,
+    used: NDArray[np.intp],
+    pace: float,
+    bands: tuple[float, float],
+    knots: int,
+    progress: Progress | None,
 ) -> tuple[Fit, Assessment]:
     """Return the motion that explains the frames best, of all hypotheses that are worth a look."""
+    band, finest = bands
     fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
     size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
     _, low = _grouped(stack, used, size)
@@ -156,15 +183,19 @@ def _best_motion(
         new = [fit for fit in near if not any(_repeats(fit, other) for other in tried)]
         tried += new
         for rival in new:
-            fitted = _fine_fit(rival, low, band, smooth=not knots)
+            fitted = _fine_fit(rival, ObjectModel.simplest(low, band, rival.R), smooth=not knots)
             best = min(best or fitted, fitted, key=lambda one: one[0].cost - one[1].degrees)
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
     fit, assessment = best
+    if finest > band and fit.axes != (2,):
+        model = ObjectModel(low, finest, guard=fit.model.guard)
+        fit = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
+        assessment = model.assess(fit)
     if fit.cost / assessment.degrees > CERTIFIED:
-        return _with_model_error(fit, assessment, band)
-    return best
+        return _with_model_error(fit, assessment, finest)
+    return fit, assessment
 
 
 def _repeats(one: Candidate, other: Candidate) -> bool:
@@ -283,10 +314,9 @@ def _coarse_fits(
     ]
 
 
-def _fine_fit(coarse: Fit, low: LowBand, band: float, *, smooth: bool) -> tuple[Fit, Assessment]:
-    """Go on with as fine an object model as the frames pay for, and judge the motion by it."""
-    model = ObjectModel.simplest(low, band, coarse.R)
-    fit = model.fit(coarse.path, low.time, coarse.spline, smooth=smooth)
+def _fine_fit(coarse: Fit, model: ObjectModel, *, smooth: bool) -> tuple[Fit, Assessment]:
+    """Go on with a finer object model, and judge the motion by it."""
+    fit = model.fit(coarse.path, model.low.time, coarse.spline, smooth=smooth)
     return _simplest(model, fit, model.assess(fit))
 
 
@@ -295,8 +325,23 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     omega = np.median(np.abs(fit.path.omega), axis=0)
     if np.hypot(omega[0], omega[1]) >= _NEARLY_PLANAR * omega[2]:
         return fit, assessment
-    smooth = fit.roughness is not None
-    planar = model.fit(fit.path.planar(), fit.low.time, fit.spline, smooth=smooth, axes=(2,))
+    # most rotations that are not about the optical axis alone show it at once
+    coarse = ObjectModel(model.low, min(model.band, _COARSE_BAND / model.low.radius), guard=model.guard)
+    rich = coarse.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None)
+    if _planar(coarse, rich, coarse.assess(rich)) is None:
+        return fit, assessment
+    simpler = _planar(model, fit, assessment)
+    if simpler is None:
+        return fit, assessment
+    # how far out of the image plane it might turn is what the richer motion tells
+    return simpler[0], replace(simpler[1], covariance=assessment.covariance)
+
+
+def _planar(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment] | None:
+    """Return the best rotation about the optical axis alone, if it explains the images as well."""
+    planar = model.fit(
+        fit.path.planar(), fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=(2,)
+    )
     simpler = model.assess(planar)
     misfit = max(fit.cost / assessment.degrees, 1.0)
     # seen from one side only, the object has fewer parameters too. Turns out of the plane times what they
@@ -305,10 +350,7 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     turns = max(assessment.parameters - simpler.parameters, 0.0)
     shown = max(simpler.degrees - assessment.degrees - turns, 0.0)
     by_noise = (np.sqrt(shown) + np.sqrt(turns) + _SIGNIFICANT / np.sqrt(2)) ** 2
-    if planar.cost - fit.cost >= misfit * by_noise:
-        return fit, assessment
-    # how far out of the image plane it might turn is what the richer motion tells
-    return planar, replace(simpler, covariance=assessment.covariance)
+    return (planar, simpler) if planar.cost - fit.cost < misfit * by_noise else None
 
 
 def _relative_noise(stack: Stack) -> float:

@@ -206,7 +206,7 @@ class ObjectModel:
         """
 
         def surprise(model: ObjectModel) -> float:
-            views = model._views(R)
+            views = model.views(R)
             return model._cost(views, model.low.modes) + 2 * views.seen
 
         models = [cls(low, band, guard=guard) for guard in GUARDS]
@@ -219,7 +219,7 @@ class ObjectModel:
 
     def cost(self, R: Array, modes: ComplexArray) -> float:
         """Return the misfit of ``(G, 3, 3)`` rotations to ``(G, K)`` modes, the object eliminated."""
-        return self._cost(self._views(R), modes)
+        return self._cost(self.views(R), modes)
 
     def fit(
         self,
@@ -321,7 +321,7 @@ class ObjectModel:
     def normal(self, fit: Fit) -> Normal:
         """Return the normal equations at a fit of this model."""
         values = fit.spline.values(fit.low.time)
-        views = self._views(fit.R)
+        views = self.views(fit.R)
         state = self._state(views, fit.low.modes)
         eliminated = self._eliminated(views, state, values)
         return Normal(views, state, eliminated, self._noise_hessian(views, state, eliminated, values))
@@ -391,7 +391,7 @@ class ObjectModel:
     def _square(self, modes: ComplexArray) -> float:
         return float(np.sum(np.abs(self._root * modes) ** 2))
 
-    def _views(self, R: Array) -> _Views:
+    def views(self, R: Array) -> Views:
         """Return what the orientations alone decide: where the frames look, and the normal matrix."""
         points = slice_points(R, self.low.k, self.spacing)
         density = (self._gain**2).ravel().astype(complex)
@@ -403,18 +403,21 @@ class ObjectModel:
         even[:, -1] *= np.sqrt(0.5)
         for block in (even, odd):
             block[np.diag_indices(len(block))] += 1.0
-        factors, halves = zip(*in_parallel(_factored, (even, odd)), strict=True)
+        blocks = [even.copy(), odd.copy()] if ObjectBlock.is_dense(len(self.position), 2 * len(R)) else None
+        halves = in_parallel(_inverse_factor, (even, odd))
         # not the trace of N⁻¹ A Aᵀ, of which rounding would leave little
-        seen = float(sum(len(half) - np.sum(half**2) for half in halves))
-        return _Views(R, points, [even, odd], list(factors), list(halves), seen)
+        seen = float(sum(len(half) - np.vdot(half, half) for half in halves))
+        return Views(R, points, halves, blocks, seen)
 
-    def _seen_slopes(self, views: _Views) -> Array:
+    def _seen_slopes(self, views: Views) -> Array:
         """Return the ``(G, 3)`` derivatives of ``views.seen`` by small rotations ε, ``R → R exp([ε]×)``.
 
         d tr(1 − N⁻¹) = tr(N⁻² dN), a sum over differences of lattice points.
         """
         even, odd = in_parallel(_inverse_square, views.halves)
         odd = np.pad(odd, (0, 1))
+        for lower in (even, odd):  # stands for both triangles
+            lower[np.diag_indices(len(lower))] *= 0.5
         even[-1] *= np.sqrt(0.5)
         even[:, -1] *= np.sqrt(0.5)
         edge = 4 * self._half + 1
@@ -422,7 +425,7 @@ class ObjectModel:
         total += np.bincount(self._sum.ravel(), (even - odd).ravel(), edge**3)
         cube = total.reshape(edge, edge, edge)
         cube += cube[::-1, ::-1, ::-1]
-        place = 0.5 * self.spacing * np.arange(-2 * self._half, 2 * self._half + 1)
+        place = self.spacing * np.arange(-2 * self._half, 2 * self._half + 1)
         # transforms of odd real numbers are imaginary: two fit into one
         along = np.stack([cube * place[:, None, None] + 1j * cube * place[:, None], cube * place])
         two, third = project(views.points, along, _FAITHFUL).reshape(2, *self._root.shape)
@@ -430,11 +433,25 @@ class ObjectModel:
         turned = _turning(views.R, self.low.k, slopes * self._gain**2)
         return np.asarray(turned.sum(axis=1))
 
-    def _right(self, views: _Views, whitened: ComplexArray) -> Array:
+    def right(self, views: Views, whitened: ComplexArray) -> Array:
         """Return ``(n,)`` products of all waves of the amplitudes with whitened ``(G, K)`` modes."""
         waves = (self._gain * whitened).ravel()
         lattice = back_project(views.points, waves, 2 * self._half + 1)
         return np.asarray(lattice[self._mask])
+
+    def alone(self, views: Views, whitened: ComplexArray) -> Array:
+        """Return ``(n, 2 K)`` products of all waves with each of whitened ``(G, K)`` modes alone.
+
+        First with the modes, then with i times the modes.
+        """
+        groups, size = len(whitened), 2 * self._half + 1
+        waves = self._gain * whitened
+        columns = []
+        for turn in (1, 1j):
+            for mode in range(waves.shape[1]):
+                points = [axis.reshape(groups, -1)[:, mode].copy() for axis in views.points]
+                columns.append(back_project(points, turn * waves[:, mode], size)[self._mask])
+        return np.stack(columns, axis=1)
 
     def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
@@ -444,23 +461,23 @@ class ObjectModel:
         return np.asarray(self._blob * values.reshape(len(amplitudes), -1, len(self._blob)))
 
     def _tried(self, path: Path, shift: Array) -> _Tried:
-        views = self._views(path.R[-len(shift) :])
+        views = self.views(path.R[-len(shift) :])
         modes = self.low.shifted(shift).modes
         return _Tried(path, shift, views, modes, self._solved(views, modes))
 
-    def _cost(self, views: _Views, modes: ComplexArray) -> float:
+    def _cost(self, views: Views, modes: ComplexArray) -> float:
         return self._solved(views, modes).cost
 
-    def _solved(self, views: _Views, modes: ComplexArray) -> _Solution:
-        right = self._right(views, self._root * modes)
+    def _solved(self, views: Views, modes: ComplexArray) -> _Solution:
+        right = self.right(views, self._root * modes)
         amplitude = views.solve(right)
         return _Solution(amplitude, self._square(modes) - float(right @ amplitude))
 
-    def _state(self, views: _Views, modes: ComplexArray) -> _State:
+    def _state(self, views: Views, modes: ComplexArray) -> _State:
         """Solve for the object; return what the gradient needs."""
         return self._linearized(views, modes, self._solved(views, modes))
 
-    def _linearized(self, views: _Views, modes: ComplexArray, solution: _Solution) -> _State:
+    def _linearized(self, views: Views, modes: ComplexArray, solution: _Solution) -> _State:
         model, slopes = self._model(views.R, views.points, solution.amplitude)
         residual = (modes - model) * self._root
         return _State(solution.amplitude, residual, slopes * self._root[..., None], solution.cost)
@@ -477,7 +494,7 @@ class ObjectModel:
         return model, np.concatenate([slopes, shifts], axis=-1)
 
     def _downhill(
-        self, views: _Views, state: _State, eliminated: Eliminated, seen_slopes: Array, values: Array
+        self, views: Views, state: _State, eliminated: Eliminated, seen_slopes: Array, values: Array
     ) -> tuple[Array, Array, float]:
         """Return half the gradient, ``(P,)``, and ``(G, 2)`` shifts, where the object and the shifts follow.
 
@@ -487,7 +504,7 @@ class ObjectModel:
         turning, shifting = gradient[:, :3] - 0.5 * seen_slopes, gradient[:, 3:]
         turning -= np.einsum("gij,gj->gi", eliminated.carry, shifting)
         alone = np.einsum("gij,gj->gi", eliminated.shift_covariance, shifting)
-        pull = self._right(views, np.einsum("gki,gi->gk", state.slopes[..., 3:], alone))
+        pull = self.right(views, np.einsum("gki,gi->gk", state.slopes[..., 3:], alone))
         pull = np.concatenate(_folded(pull))
         downhill = (values.T @ turning).ravel() + pull @ eliminated.solution
         answer = eliminated.block.solve(pull[:, None])[:, 0]
@@ -495,7 +512,7 @@ class ObjectModel:
         return downhill, _without_drift(still, views.R), float(np.sum(shifting * still))
 
     def _follow(
-        self, views: _Views, state: _State, eliminated: Eliminated, turn: Array, answer: Array
+        self, views: Views, state: _State, eliminated: Eliminated, turn: Array, answer: Array
     ) -> Array:
         """Return the ``(G, 2)`` shifts that follow ``(G, 3)`` turns and minus an ``(n,)`` folded object."""
         waves = self._root * self._waves(views.points, [_unfolded(answer)])[0]
@@ -526,7 +543,7 @@ class ObjectModel:
                 return gain, tried
         return 0.0, now
 
-    def _eliminated(self, views: _Views, state: _State, values: Array) -> Eliminated:
+    def _eliminated(self, views: Views, state: _State, values: Array) -> Eliminated:
         """Eliminate the object and the shifts from the normal equations of a motion."""
         turns, shifts = state.slopes[..., :3], state.slopes[..., 3:]
         inverse = _shift_covariance(shifts)
@@ -539,11 +556,11 @@ class ObjectModel:
                 _add_bent(coupling, values[part], column[..., :3])
                 yield np.asfortranarray(column[..., 3:].transpose(1, 0, 2).reshape(len(self.position), -1))
 
-        block = ObjectBlock(views.blocks, views.factors, parts(), 2 * len(values))
+        block = ObjectBlock(views.halves, parts(), 2 * len(values), views.blocks)
         hessian, solution = _without_object(values, alone, coupling, block)
         return Eliminated(hessian, solution, block, inverse, carry)
 
-    def _noise_hessian(self, views: _Views, state: _State, eliminated: Eliminated, values: Array) -> Array:
+    def _noise_hessian(self, views: Views, state: _State, eliminated: Eliminated, values: Array) -> Array:
         """Return the ``(P, P)`` mean normal matrix of a motion of objects that are fitted to noise alone."""
         rng = np.random.default_rng(0)
 
@@ -552,7 +569,7 @@ class ObjectModel:
             real, imaginary = rng.standard_normal((2, *self._root.shape))
             # a mode that stands for itself alone is real
             noise = real + 1j * (self._share > 1) * imaginary
-            _, slopes = self._model(views.R, views.points, views.solve(self._right(views, noise)))
+            _, slopes = self._model(views.R, views.points, views.solve(self.right(views, noise)))
             turns = slopes[..., :3] * self._root[..., None]
             return _without_shifts(turns, state.slopes[..., 3:], eliminated.shift_covariance)[1]
 
@@ -562,7 +579,7 @@ class ObjectModel:
             _add_bent(coupling, values[part], column)
         return _without_object(values, alone, coupling, eliminated.block)[0] / _PROBES
 
-    def _columns(self, views: _Views, whitened: ComplexArray) -> Iterator[tuple[slice, Array]]:
+    def _columns(self, views: Views, whitened: ComplexArray) -> Iterator[tuple[slice, Array]]:
         """Yield parts of the frames with the ``(g, n, C)`` products of all waves and ``(G, K, C)`` modes."""
         for part in _parts(len(whitened)):
             yield part, self._back_projected(views.R[part], whitened[part] * self._gain[part, :, None])
@@ -593,27 +610,29 @@ class ObjectModel:
 
 
 @dataclass(frozen=True)
-class _Views:
+class Views:
     """Orientations of the frames: their modes' places in units of the lattice, the object's normal matrix.
 
-    The matrix is of folded amplitudes, an even block and an odd one; with lower Cholesky factors and their
-    inverses. `seen` is how many amplitudes the frames determine.
+    The matrix is of folded amplitudes, an even block and an odd one. `halves` are the inverses of their lower
+    Cholesky factors; the `blocks` themselves are there where `ObjectBlock` wants them. `seen` is how many
+    amplitudes the frames determine.
     """
 
     R: Array
     points: list[Array]
-    blocks: list[Array]
-    factors: list[Array]
     halves: list[Array]
+    blocks: list[Array] | None
     seen: float
 
     def solve(self, right: Array) -> Array:
         """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""
-        parts = [
-            scipy.linalg.cho_solve((factor, True), part, check_finite=False)
-            for factor, part in zip(self.factors, _folded(right), strict=True)
-        ]
-        return _unfolded(np.concatenate(parts))
+        halves = [half.T @ (half @ part) for half, part in zip(self.halves, _folded(right), strict=True)]
+        return _unfolded(np.concatenate(halves))
+
+    def lessened(self, right: Array) -> Array:
+        """Return ``(n, ...)`` L⁻¹ times right-hand sides; the object explains the squares of its columns."""
+        halves = [half @ part for half, part in zip(self.halves, _folded(right), strict=True)]
+        return np.concatenate(halves)
 
 
 @dataclass(frozen=True)
@@ -630,23 +649,22 @@ class _Tried:
 
     path: Path
     shift: Array
-    views: _Views
+    views: Views
     modes: ComplexArray
     solution: _Solution
 
 
-def _factored(block: Array) -> tuple[Array, Array]:
-    """Return the lower Cholesky factor of a matrix and the factor's inverse."""
-    factor = scipy.linalg.cholesky(block, lower=True, check_finite=False)
-    return factor, scipy.linalg.lapack.dtrtri(factor, lower=True)[0]
+def _inverse_factor(block: Array) -> Array:
+    """Return the inverse of the lower Cholesky factor of a symmetric matrix, which is overwritten."""
+    factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=True, check_finite=False)
+    return np.asarray(scipy.linalg.lapack.dtrtri(factor, lower=True, overwrite_c=True)[0])
 
 
 def _inverse_square(half: Array) -> Array:
-    """Return the square of the inverse of a matrix, from the inverse of its lower Cholesky factor."""
+    """Return the lower triangle of N⁻², from the inverse of the lower Cholesky factor of N."""
     lower, _ = scipy.linalg.lapack.dlauum(half, lower=True)
-    inverse = np.tril(lower) + np.tril(lower, -1).T
-    square = scipy.linalg.blas.dsyrk(1.0, inverse, lower=True)
-    return np.asarray(np.tril(square) + np.tril(square, -1).T)
+    lower += np.tril(lower, -1).T
+    return np.asarray(scipy.linalg.blas.dsyrk(1.0, lower, lower=True))
 
 
 def _turning(R: Array, k: Array, gradient: NDArray[Any]) -> NDArray[Any]:
@@ -660,13 +678,13 @@ def _turning(R: Array, k: Array, gradient: NDArray[Any]) -> NDArray[Any]:
 
 
 def _folded(lattice: Array) -> tuple[Array, Array]:
-    """Return ``(n,)`` numbers on the lattice as their even and odd parts, normalized.
+    """Return ``(n, ...)`` numbers on the lattice as their even and odd parts, normalized.
 
     Point n − 1 − i lies opposite to point i; the one in the middle ends the even part.
     """
     half = len(lattice) // 2
     first, opposite = lattice[:half], lattice[:half:-1]
-    even = np.append(np.sqrt(0.5) * (first + opposite), lattice[half])
+    even = np.concatenate([np.sqrt(0.5) * (first + opposite), lattice[half : half + 1]])
     return even, np.sqrt(0.5) * (first - opposite)
 
 
@@ -697,7 +715,7 @@ def _coefficients(spline: Spline, axes: tuple[int, ...]) -> NDArray[np.intp]:
 class Normal:
     """Normal equations of a motion, and what noise in the object adds to them, ``(P, P)``."""
 
-    views: _Views
+    views: Views
     state: _State
     eliminated: Eliminated
     by_noise: Array

@@ -19,10 +19,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
-from trapcli.motion.fourier_slices import back_project, conjugate_share, slice_points
+from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import ObjectModel
@@ -34,7 +33,7 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _LINE_BAND = 1.0  # band times radius of the reduced map, of which nothing is used
-_BAND = 22.0  # band times radius: that of the object model which judges the motion
+_BAND = 28.0  # band times radius: that of the object model which judges the motion
 _SPACING = 0.7  # of the points, in units of π / band
 _REACH = 1.1  # of the points, in radii of the object
 _GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
@@ -248,39 +247,18 @@ class _Told:
 
 def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
     """Eliminate the object."""
-    low, k = views.low, views.low.k
-    weight = conjugate_share(k) / low.variance
-    lattice = ObjectModel(low, _BAND / low.radius)
-    spacing = lattice.spacing
-    index = np.rint(lattice.position / spacing).astype(int)
-    half = int(index.max())
-    edge = 4 * half + 1
-    flat = index @ np.array([edge**2, edge, 1])
-    # amplitudes of unit variance give the power that is seen
-    scale = np.sqrt(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)) / len(index))
-    density = np.tile(weight * scale**2, len(R)).astype(complex)
-    kernel = back_project(slice_points(R, k, spacing), density, edge).ravel()
-    normal = kernel[flat[:, None] - flat + kernel.size // 2]
-    normal[np.diag_indices(len(normal))] += 1.0
-    factor = scipy.linalg.cholesky(normal, lower=True, overwrite_a=True, check_finite=False)
-
-    def gathered(modes: ComplexArray, k: Array) -> Array:
-        """Return the products of all the object's waves with ``(G, K)`` modes."""
-        everywhere = back_project(slice_points(R, k, spacing), scale * modes.ravel(), 2 * half + 1)
-        return np.asarray(everywhere[tuple((index + half).T)], float)
-
+    low = views.low
+    model = ObjectModel(low, _BAND / low.radius)
+    seen = model.views(R)
+    root = np.sqrt(conjugate_share(low.k) / low.variance)
+    phase, modes = root * views.phase, root * low.modes
     own = np.concatenate([points.waves.real, points.waves.imag])
-    one = [gathered(weight[j] * views.phase[:, j], k[j : j + 1]) for j in range(len(k))]
-    other = [gathered(1j * weight[j] * views.phase[:, j], k[j : j + 1]) for j in range(len(k))]
-    mixed = np.stack(one + other, axis=1) @ own
-    mixed, right = (
-        scipy.linalg.solve_triangular(factor, columns, lower=True, check_finite=False)
-        for columns in (mixed, gathered(weight * low.modes, k))
-    )
-    power = np.tile(weight * np.sum(np.abs(views.phase) ** 2, axis=0), 2)
-    product = weight * np.sum(views.phase.conj() * low.modes, axis=0)
+    mixed = seen.lessened(model.alone(seen, phase) @ own)
+    right = seen.lessened(model.right(seen, modes))
+    power = np.tile(np.sum(np.abs(phase) ** 2, axis=0), 2)
+    product = np.sum(phase.conj() * modes, axis=0)
     curvature = own.T @ (power[:, None] * own) - mixed.T @ mixed
     pull = own.T @ np.concatenate([product.real, product.imag]) - mixed.T @ right
-    square = float(np.sum(weight * np.abs(low.modes) ** 2))
-    degrees = max(weight.sum() * low.variance * len(R) - len(normal) - 2 * len(R), 1.0)
+    square = float(np.sum(np.abs(modes) ** 2))
+    degrees = max(model.data_count - len(model.position) - 2 * len(R), 1.0)
     return _Told(curvature, pull, square - float(right @ right), degrees)
