@@ -46,7 +46,7 @@ def test_where_nothing_stays_nothing_is_found(turning: tuple[np.ndarray, Motion]
 
 def test_dust_is_found_up_to_the_frequencies_that_judge_the_motion() -> None:
     # what stays at higher ones would bend the motion
-    assert standing._BAND == joint._FINEST_BAND
+    assert standing._FINEST_BAND == joint._FINEST_BAND
 
 
 def test_nothing_is_found_where_the_motion_is_not_known(turning: tuple[np.ndarray, Motion]) -> None:

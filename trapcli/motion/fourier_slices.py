@@ -85,6 +85,19 @@ def project(points: list[Array], lattice: Real | Complex, accuracy: float = _DOU
 def back_project(points: list[Array], values: Complex, size: int) -> Real:
     """Return ``Re Σ values exp(i⟨point, b⟩)`` at the lattice points b, the adjoint of `project`.
 
+    Parameters are those of `gather`.
+
+    Returns
+    -------
+    ndarray
+        ``(size, size, size)`` in the order x1, x2, x3.
+    """
+    return np.asarray(gather(points, values, size).real)
+
+
+def gather(points: list[Array], values: Complex, size: int) -> Complex:
+    """Return ``Σ values exp(i⟨point, b⟩)`` at the lattice points b.
+
     Parameters
     ----------
     values:
@@ -95,13 +108,13 @@ def back_project(points: list[Array], values: Complex, size: int) -> Real:
     Returns
     -------
     ndarray
-        ``(size, size, size)`` in the order x1, x2, x3.
+        ``(size, size, size)`` in the order x1, x2, x3, complex.
     """
     single = values.dtype == np.complex64
-    lattice = finufft.nufft3d1(
+    lattice: Complex = finufft.nufft3d1(
         *_in_precision(points, single), values, (size,) * 3, isign=1, **_options(single, values.size)
     )
-    return np.asarray(lattice.real)
+    return lattice
 
 
 def _in_precision(points: list[Array], single: bool) -> list[Real]:

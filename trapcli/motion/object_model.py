@@ -32,7 +32,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from trapcli.motion.elimination import Eliminated, ObjectBlock, bent_blocks
-from trapcli.motion.fourier_slices import back_project, conjugate_share, project, slice_points
+from trapcli.motion.fourier_slices import back_project, conjugate_share, gather, project, slice_points
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.path import Path, Spline, cross_matrix
@@ -444,14 +444,12 @@ class ObjectModel:
 
         First with the modes, then with i times the modes.
         """
-        groups, size = len(whitened), 2 * self._half + 1
-        waves = self._gain * whitened
-        columns = []
-        for turn in (1, 1j):
-            for mode in range(waves.shape[1]):
-                points = [axis.reshape(groups, -1)[:, mode].copy() for axis in views.points]
-                columns.append(back_project(points, turn * waves[:, mode], size)[self._mask])
-        return np.stack(columns, axis=1)
+        waves = np.asfortranarray(self._gain * whitened)
+        sums = np.empty((len(self.position), waves.shape[1]), complex)
+        for mode in range(waves.shape[1]):
+            points = [axis.reshape(waves.shape)[:, mode].copy() for axis in views.points]
+            sums[:, mode] = gather(points, waves[:, mode], 2 * self._half + 1)[self._mask]
+        return np.concatenate([sums.real, -sums.imag], axis=1)
 
     def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""

@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _LINE_BAND = 1.0  # band times radius of the reduced map, of which nothing is used
-_BAND = 28.0  # band times radius: that of the object model which judges the motion
+_BAND = 22.0  # band times radius while the motion is fitted again
+_FINEST_BAND = 28.0  # the same in the end: that of the finest object model which judges the motion
 _SPACING = 0.7  # of the points, in units of π / band
 _REACH = 1.1  # of the points, in radii of the object
 _GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
@@ -72,7 +73,7 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
     if len(known) < _FEWEST_GROUPS:
         return None
     front = read_front_end(
-        frames, time=motion.time, pixel_size=pixel_size, line_band=_LINE_BAND, fine_band=_BAND
+        frames, time=motion.time, pixel_size=pixel_size, line_band=_LINE_BAND, fine_band=_FINEST_BAND
     )
     # the centres that the fit has found are better than those of single frames
     low = front.low.shifted(motion.center - front.centers.center).select(known)
@@ -80,22 +81,26 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
     path = Path(time, R, R[:, 0])
     turned = float(np.sum(np.linalg.norm(path.mean_omega(), axis=1) * np.diff(time)))
     size = max(1, min(int(_GROUP * len(known) / turned), len(known) // _FEWEST_GROUPS))
-    views = _Views.of(low, center, size)
+    finest = _Views.of(low, center, size)
+    views = finest.within(_BAND)
     intervals = min(max(_FEWEST_KNOTS, round(turned / _KNOTS)), len(views.low.time) // 3)
     spline = Spline(time[0], time[-1], intervals)
     path = path.near(spline, np.concatenate([spline.grid, views.low.time]))
-    points = _Points.over(low, np.median(center, axis=0))
-    odds, values = _pattern(views, path, points)
+    middle = np.median(center, axis=0)
+    points = _Points.over(views.low, middle, _BAND)
+    odds, values = _pattern(views, path, points, _BAND)
     if odds < _CONVINCING:
         return None
     for _ in range(_ROUNDS):
         model = ObjectModel(views.without(points.waves @ values), _BAND / low.radius)
         fit = model.fit(path, views.low.time, spline, steps=_STEPS)
         path, before = fit.path, values
-        _, values = _pattern(views.shifted(fit.shift), path, points)
+        _, values = _pattern(views.shifted(fit.shift), path, points, _BAND)
         change = np.linalg.norm(points.waves @ (values - before))
         if change < _SETTLED * np.linalg.norm(points.waves @ values):
             break
+    points = _Points.over(low, middle, _FINEST_BAND)
+    _, values = _pattern(finest.shifted(fit.shift), path, points, _FINEST_BAND)
     return points.image(values, frames.shape[1:], pixel_size)
 
 
@@ -130,6 +135,12 @@ class _Views:
         grouped = low.grouped(size)
         return cls(grouped, group_means(np.exp(1j * center @ low.k.T), len(grouped.time)))
 
+    def within(self, band: float) -> _Views:
+        """Leave out modes beyond `band` over the object's radius."""
+        kept = np.hypot(self.low.k[:, 0], self.low.k[:, 1]) * self.low.radius <= band
+        low = replace(self.low, k=self.low.k[kept], modes=self.low.modes[:, kept])
+        return _Views(low, self.phase[:, kept])
+
     def shifted(self, shift: Array) -> _Views:
         """Move the centres by ``(G, 2)`` `shift`."""
         return _Views(self.low.shifted(shift), self.phase * np.exp(1j * shift @ self.low.k.T))
@@ -161,9 +172,9 @@ class _Points:
     waves: ComplexArray
 
     @classmethod
-    def over(cls, low: LowBand, middle: Array) -> _Points:
-        """Lay points, as close as the band can tell them apart, over the disc of the object."""
-        spacing, reach = _SPACING * np.pi * low.radius / _BAND, _REACH * low.radius
+    def over(cls, low: LowBand, middle: Array, band: float) -> _Points:
+        """Lay points, as close as `band` over the radius can tell them apart, over the disc of the object."""
+        spacing, reach = _SPACING * np.pi * low.radius / band, _REACH * low.radius
         axis = np.arange(-int(reach / spacing), int(reach / spacing) + 1) * spacing
         square = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         place = square[np.hypot(*square.T) <= reach] + middle
@@ -182,9 +193,9 @@ class _Points:
         return np.asarray(np.where(near, image, 0.0))
 
 
-def _pattern(views: _Views, path: Path, points: _Points) -> tuple[float, Array]:
+def _pattern(views: _Views, path: Path, points: _Points, band: float) -> tuple[float, Array]:
     """Return the logarithm of the odds that there is a pattern, and the ``(P,)`` values of its points."""
-    told = _without_object(views, path.R[-len(views.phase) :], points)
+    told = _without_object(views, path.R[-len(views.phase) :], points, band)
     # where the motion or the model is wrong, what is left over is no pattern for that alone
     misfit = (told.square - told.likeliest().gain) / told.degrees
     told = told.doubted(max(1.0, misfit))
@@ -245,10 +256,10 @@ class _Told:
         return covariance @ self.pull, np.diagonal(covariance)
 
 
-def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
+def _without_object(views: _Views, R: Array, points: _Points, band: float) -> _Told:
     """Eliminate the object."""
     low = views.low
-    model = ObjectModel(low, _BAND / low.radius)
+    model = ObjectModel(low, band / low.radius)
     seen = model.views(R)
     root = np.sqrt(conjugate_share(low.k) / low.variance)
     phase, modes = root * views.phase, root * low.modes
