@@ -140,3 +140,21 @@ def test_align_leaves_what_is_not_gauge(two_turns: Any) -> None:
     turn = Rotation.from_rotvec(0.02 * np.tile([0, 1, 0], (50, 1)) * np.linspace(-1, 1, 50)[:, None])
     angles, _ = align(R @ turn.as_matrix(), R)
     assert 0.002 < angles.mean() < 0.02
+
+
+def test_the_simplest_path_nearby_has_lost_its_wiggles() -> None:
+    fine, time = Spline(0.0, 10.0, 60), np.linspace(0, 10, 400)
+    smooth = Path.smooth(fine, fine.fit(time, np.stack([np.sin(time), 0 * time + 1, 0.1 * time], 1)), time)
+    wiggles = np.random.default_rng(0).normal(size=(fine.size, 3))
+    shuffled = np.random.default_rng(1).permutation(len(time))
+    rough = smooth.bent(fine, 0.005 * wiggles)
+    rough = Path(time[shuffled], rough.R[shuffled], rough.omega[shuffled])
+    simple = rough.simplest(fine, 0.02)
+    assert align(simple.R, rough.R)[0].mean() < 0.02
+
+    def roughness(path: Path) -> float:
+        return float(np.abs(np.diff(path.omega[np.argsort(path.time)], 2, axis=0)).mean())
+
+    assert roughness(simple) < 2 * roughness(smooth) < 0.1 * roughness(rough)
+    # what only as many intervals can follow stays as it is
+    assert rough.simplest(fine, 1e-9) is rough

@@ -69,6 +69,7 @@ _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that com
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
+_NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have which is fitted in its place
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
@@ -308,7 +309,7 @@ def _coarse_fits(
         return first
     least = min(fit.cost for fit in first)
     return [
-        light(model.fit(fit.path, low.time, spline))
+        light(model.fit(fit.path.simplest(spline, _NEAR), low.time, spline))
         for fit, spline in zip(first, finer, strict=True)
         if fit.cost <= _LIKELY * least
     ]
@@ -316,7 +317,9 @@ def _coarse_fits(
 
 def _fine_fit(coarse: Fit, model: ObjectModel, *, smooth: bool) -> tuple[Fit, Assessment]:
     """Go on with a finer object model, and judge the motion by it."""
-    fit = model.fit(coarse.path, model.low.time, coarse.spline, smooth=smooth)
+    # wiggles that bending can't quite undo would pass for a motion that is rough
+    path = coarse.path.simplest(coarse.spline, _NEAR) if smooth else coarse.path
+    fit = model.fit(path, model.low.time, coarse.spline, smooth=smooth)
     return _simplest(model, fit, model.assess(fit))
 
 

@@ -7,7 +7,7 @@ spline coefficient moves a few knots' worth of the path and nothing else, so tha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from scipy.spatial.transform import Rotation
 from trapcli.motion.integrate import integrate_rotation
 
 Array = NDArray[np.float64]
+
+_FEWEST = 3  # intervals of the simplest path that is tried
 
 
 @dataclass(frozen=True)
@@ -96,9 +98,29 @@ class Path:
     def near(self, spline: Spline, times: Array) -> Path:
         """Return the path of the spline nearest to ω of this one, at other `times` in any order."""
         middle = 0.5 * (self.time[1:] + self.time[:-1])
+        return Path._at(spline, spline.fit(middle, self.mean_omega()), times)
+
+    def simplest(self, spline: Spline, tolerance: float) -> Path:
+        """Return the path near this one, at its times, whose ω is a spline of the fewest intervals.
+
+        Near is a mean angle up to `tolerance` [rad]. Where that takes as many intervals as `spline` has, it
+        is this path itself.
+        """
+        intervals = _FEWEST
+        while intervals < spline.intervals:
+            fewer = replace(spline, intervals=intervals)
+            path = Path._at(fewer, fewer.fit(self.time, self.omega), self.time)
+            if align(path.R, self.R)[0].mean() <= tolerance:
+                return path
+            intervals += 1 + intervals // 3
+        return self
+
+    @classmethod
+    def _at(cls, spline: Spline, coefficients: Array, times: Array) -> Path:
+        """Return the path of an ω that is a spline, at times in any order."""
         ascending, back = np.unique(times, return_inverse=True)
-        smooth = Path.smooth(spline, spline.fit(middle, self.mean_omega()), ascending)
-        return Path(times, smooth.R[back], smooth.omega[back])
+        smooth = cls.smooth(spline, coefficients, ascending)
+        return cls(times, smooth.R[back], smooth.omega[back])
 
     def bent(self, spline: Spline, coefficients: Array) -> Path:
         """Return ``R exp([δ]×)`` for the spline δ with ``(..., size, 3)`` coefficients [rad]."""
