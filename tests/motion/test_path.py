@@ -144,7 +144,8 @@ def test_align_leaves_what_is_not_gauge(two_turns: Any) -> None:
 
 def test_the_simplest_path_nearby_has_lost_its_wiggles() -> None:
     fine, time = Spline(0.0, 10.0, 60), np.linspace(0, 10, 400)
-    smooth = Path.smooth(fine, fine.fit(time, np.stack([np.sin(time), 0 * time + 1, 0.1 * time], 1)), time)
+    omega = np.stack([np.sin(time), np.ones_like(time), 0.1 * time], axis=1)
+    smooth = Path.smooth(fine, fine.fit(time, omega), time)
     wiggles = np.random.default_rng(0).normal(size=(fine.size, 3))
     shuffled = np.random.default_rng(1).permutation(len(time))
     rough = smooth.bent(fine, 0.005 * wiggles)
@@ -155,6 +156,6 @@ def test_the_simplest_path_nearby_has_lost_its_wiggles() -> None:
     def roughness(path: Path) -> float:
         return float(np.abs(np.diff(path.omega[np.argsort(path.time)], 2, axis=0)).mean())
 
-    assert roughness(simple) < 2 * roughness(smooth) < 0.1 * roughness(rough)
+    assert roughness(simple) < 0.1 * roughness(rough)
     # what only as many intervals can follow stays as it is
     assert rough.simplest(fine, 1e-9) is rough
