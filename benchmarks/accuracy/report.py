@@ -29,8 +29,6 @@ LINEAR = 20.0  # degrees beyond which a bound, which takes angles for small, say
 FIELD = "auto+field"
 """The method that is given an image of the empty field as well."""
 QUANTITIES = {"T": "T", "phi": "φ", "omega_3": "ω₃", "alpha": "α", "R": "R"}
-BETTER = 0.01  # noise at which ASPIRE is compared with
-
 Result = dict[str, Any]
 
 
@@ -245,16 +243,26 @@ def _cell(runs: list[Result]) -> str:
 
 def _better(results: Result, curve: Curve) -> list[str]:
     """Say by how much `auto` is better than the best of ASPIRE, on ASPIRE's frames."""
-    ours = _runs(results, curve, BETTER, "auto")
-    theirs = [_average(_runs(results, curve, BETTER, m)) for m in COLUMNS if "/" in m]
-    best = min((average[0] for average in theirs if average), default=None)
-    if best is None or not ours or any(run.get("mean_of_60") is None for run in ours):
+    lines = []
+    for name, words in (("single", "single frames"), ("averaged", "frames averaged with their neighbours")):
+        ratios = []
+        for noise in NOISE:
+            ours = _runs(results, curve, noise, "auto")
+            theirs = [_average(_runs(results, curve, noise, m)) for m in COLUMNS if m.endswith(f"/{name}")]
+            best = min((average[0] for average in theirs if average), default=None)
+            if best is not None and ours and all(run.get("mean_of_60") is not None for run in ours):
+                mean = float(np.mean([run["mean_of_60"] for run in ours]))
+                ratios.append(f"{best / mean:.3g} at {100 * noise:g} %")
+        if ratios:
+            lines.append(f"- from {words}: {', '.join(ratios)}")
+    if not lines:
         return []
-    mean = float(np.mean([run["mean_of_60"] for run in ours]))
     return [
         "",
-        f"At {100 * BETTER:g} % the best of ASPIRE's is {_digits(best)}° off on its 60 frames; `auto`, which",
-        f"has seen all, is {_digits(mean)}° off on the same 60: {best / mean:.0f} times less (aim: 20).",
+        "The error of ASPIRE's best on its 60 frames, over that of `auto` on the same, which has seen all",
+        "frames (aim: 20):",
+        "",
+        *lines,
     ]
 
 
@@ -300,7 +308,9 @@ are averages of draws from the bound's covariance. With a camera, the noise is t
 the object, and the empty field is taken to be known. All is computed from exact projections, without the code
 of the estimate, and a test holds it against differences of pixels. For the tumbling blobs at 1 % and the same
 spline, frequencies up to 26 lower it by 4 %; with frequencies up to 16, those of an earlier version of the
-estimate, the covariance that this states itself gives errors that are 1.5 % smaller."""
+estimate, the covariance that this states itself gives errors that are 1.5 % smaller. The sharp edges of
+grains show at higher frequencies too, and the estimate uses those up to 28: for two grains of the camera's
+row, seeds 7 and 9, these lower the bound from 0.057° to 0.050° and from 0.073° to 0.062°."""
 
 
 def _how(results: Result) -> str:

@@ -279,3 +279,23 @@ def test_a_long_noisy_stack() -> None:
     found = estimate(images, truth.time)
     assert found.identifiable
     assert np.rad2deg(align(found.R, truth.R)[0].mean()) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("phantom", "noise", "first", "last"),
+    [
+        ("grain", 0.01, (22.0, 22.0), (28.0, 28.0)),
+        ("blobs", 0.01, (22.0, 22.0), (22.0, 22.0)),
+        ("blobs", 0.5, (16.0, 20.0), (16.0, 20.0)),
+    ],
+)
+def test_the_band_ends_where_the_object_does_or_in_the_noise(
+    phantom: str, noise: float, first: tuple[float, float], last: tuple[float, float]
+) -> None:
+    images, truth = render("tumbling", phantom, 3, frames=60, pixels=96, noise=noise)
+    low = joint.read_front_end(
+        Frames.from_array(images), time=truth.time, pixel_size=PIXEL, line_band=8.0, fine_band=28.0
+    ).low
+    bands = np.array(joint._bands(low)) * low.radius
+    for band, (least, most) in zip(bands, (first, last), strict=True):
+        assert least - 1e-9 <= band <= most + 1e-9

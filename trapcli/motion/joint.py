@@ -26,9 +26,9 @@ from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Spline, align
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
-    CERTIFIED,
     COARSE,
     Stack,
+    certified,
     judge,
     nothing_known,
     to_motion,
@@ -43,8 +43,9 @@ Bools = NDArray[np.bool_]
 _FEWEST = 12  # frames
 _LINE_BAND = 8.0  # band times radius for common lines
 _COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
-_FINE_BAND = 22.0  # band times radius of the object model that tells motions apart
-_FINEST_BAND = 28.0  # the same at most in the end, where the object is as sharp as that
+_NARROWEST_BAND = 16.0  # band times radius of the object model that tells motions apart, at least
+_FINE_BAND = 22.0  # the same at most
+_FINEST_BAND = 28.0  # the same in the end, where the object is as sharp as that
 _TOLD = 5.0  # signal over noise of the object's finest parts, from all frames, up to which they help
 _WORTHWHILE = 0.05  # share in what tells the motion that makes a wider band worth its time
 _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averaged, to find the branch
@@ -71,6 +72,7 @@ _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have which is fitted in its place
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
+_PATIENCE = 5.0  # of a look with a coarse model at such a rotation, in units of what noise gives
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
@@ -150,10 +152,10 @@ def _bands(low: LowBand) -> tuple[float, float]:
     """
     radial = low.radius * np.hypot(low.k[:, 0], low.k[:, 1])
     power = np.mean(np.abs(low.modes) ** 2, axis=0) / low.variance - 1
-    ring = np.arange(_COARSE_BAND, _FINEST_BAND, 1.0)
+    ring = np.arange(_NARROWEST_BAND, _FINEST_BAND, 1.0)
     told = np.array([power[np.abs(radial - middle) <= 1.0].mean() for middle in ring])
     told *= len(low.modes) * np.pi / 2 / ring
-    last = ring[told > _TOLD].max(initial=_COARSE_BAND) + 1.0
+    last = ring[told > _TOLD].max(initial=_NARROWEST_BAND - 1.0) + 1.0
     telling = radial**2 * np.maximum(power, 0.0)  # how much a small turn changes, in units of the noise
     finer = telling[(radial > _FINE_BAND) & (radial <= last)].sum() > _WORTHWHILE * telling.sum()
     first = min(last, _FINE_BAND)
@@ -190,11 +192,11 @@ def _best_motion(
             break
     assert best is not None
     fit, assessment = best
-    if finest > band and fit.axes != (2,):
+    if finest > band and fit.axes != (2,) and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard)
         fit = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
         assessment = model.assess(fit)
-    if fit.cost / assessment.degrees > CERTIFIED:
+    if not certified(fit, assessment):
         return _with_model_error(fit, assessment, finest)
     return fit, assessment
 
@@ -331,7 +333,7 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     # most rotations that are not about the optical axis alone show it at once
     coarse = ObjectModel(model.low, min(model.band, _COARSE_BAND / model.low.radius), guard=model.guard)
     rich = coarse.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None)
-    if _planar(coarse, rich, coarse.assess(rich)) is None:
+    if _planar(coarse, rich, coarse.assess(rich), _PATIENCE) is None:
         return fit, assessment
     simpler = _planar(model, fit, assessment)
     if simpler is None:
@@ -340,8 +342,13 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     return simpler[0], replace(simpler[1], covariance=assessment.covariance)
 
 
-def _planar(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment] | None:
-    """Return the best rotation about the optical axis alone, if it explains the images as well."""
+def _planar(
+    model: ObjectModel, fit: Fit, assessment: Assessment, patience: float = 1.0
+) -> tuple[Fit, Assessment] | None:
+    """Return the best rotation about the optical axis alone, if it explains the images as well.
+
+    It may miss them by `patience` times what noise gives.
+    """
     planar = model.fit(
         fit.path.planar(), fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=(2,)
     )
@@ -353,7 +360,7 @@ def _planar(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit, 
     turns = max(assessment.parameters - simpler.parameters, 0.0)
     shown = max(simpler.degrees - assessment.degrees - turns, 0.0)
     by_noise = (np.sqrt(shown) + np.sqrt(turns) + _SIGNIFICANT / np.sqrt(2)) ** 2
-    return (planar, simpler) if planar.cost - fit.cost < misfit * by_noise else None
+    return (planar, simpler) if planar.cost - fit.cost < patience * misfit * by_noise else None
 
 
 def _relative_noise(stack: Stack) -> float:

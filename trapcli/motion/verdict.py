@@ -22,9 +22,9 @@ from trapcli.result.motion import Flag, Motion
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-CERTIFIED = 1.06
-"""Misfit per degree of freedom that pixel noise explains."""
-
+_CERTIFIED = 1.06  # misfit per degree of freedom that pixel noise explains, where there are many
+_NOISE_ERROR = 0.03  # how well the noise is known
+_SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 COARSE = np.deg2rad(1.0)
@@ -64,12 +64,18 @@ class Verdict:
     left: float = 0.0
 
 
+def certified(fit: Fit, assessment: Assessment) -> bool:
+    """Tell whether noise alone explains the misfit."""
+    scatter = _SCATTER * np.sqrt(2 / assessment.degrees)
+    return bool(fit.cost <= max(_CERTIFIED, 1 + _NOISE_ERROR + scatter) * assessment.degrees)
+
+
 def judge(fit: Fit, assessment: Assessment) -> Verdict:
     """Say whether the misfit is what the noise leaves, or what else it is."""
     misfit = fit.cost / assessment.degrees
     planar = "; it turns about the optical axis alone, as far as can be told: phi is undefined"
     about = planar if fit.axes == (2,) else ""
-    if misfit <= CERTIFIED:
+    if certified(fit, assessment):
         return Verdict(
             True, f"the motion explains the images: misfit {misfit:.3f} of what the noise gives{about}"
         )
