@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -79,17 +77,6 @@ def test_misfit_per_degree_of_freedom_is_1_at_the_truth(path: Path, seed: int) -
     # nothing was fitted but the object
     degrees = model.assess(fit).degrees + 3 * spline.size - 3 + 2 * FRAMES
     assert fit.cost / degrees == pytest.approx(1, abs=0.05)
-
-
-def test_a_mass_that_seems_to_change_is_noise(thing: Blobs, path: Path) -> None:
-    low = low_band(thing, path, 0)
-    drift = np.sin(np.linspace(0, 9, FRAMES)) * thing.mass / 100
-    drifting = replace(low, modes=low.modes + drift[:, None] * (np.arange(len(low.k)) == 0))
-    steady, model = ObjectModel(low, BAND), ObjectModel(drifting, BAND)
-    assert model.variance[0] == pytest.approx(drift.var(), rel=0.2)
-    assert (model.variance[1:] == low.variance).all()
-    change = model.cost(path.R, drifting.modes) - steady.cost(path.R, low.modes)
-    assert abs(change) < FRAMES
 
 
 def test_a_smooth_object_needs_a_coarser_lattice_than_a_sharp_one(path: Path) -> None:

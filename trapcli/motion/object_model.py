@@ -160,7 +160,7 @@ class ObjectModel:
         inside = np.hypot(low.k[:, 0], low.k[:, 1]) <= band * (1 + 1e-9)
         self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
         self.band, self.guard = band, guard
-        self.variance = self._noise() if variance is None else variance[inside]
+        self.variance = np.full(inside.sum(), low.variance) if variance is None else variance[inside]
         self.weights = np.ones(len(low.time)) if weights is None else weights
         self._share = conjugate_share(self.low.k)
         self._root = np.sqrt(self.weights[:, None] * self._share / self.variance)
@@ -211,15 +211,6 @@ class ObjectModel:
 
         models = [cls(low, band, guard=guard) for guard in GUARDS]
         return models[int(np.argmin(in_parallel(surprise, models)))]
-
-    def _noise(self) -> Array:
-        """Return the ``(K,)`` noise of each mode: of pixels, and for k = 0 of mass and level as well.
-
-        The mass doesn't change; what seems to change of it is how the level around the object was measured.
-        """
-        noise = np.full(len(self.low.k), self.low.variance)
-        noise[0] = max(self.low.variance, float(np.var(self.low.modes[:, 0].real)))
-        return noise
 
     @property
     def data_count(self) -> float:
