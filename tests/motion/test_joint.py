@@ -299,3 +299,14 @@ def test_the_band_ends_where_the_object_does_or_in_the_noise(
     bands = np.array(joint._bands(low)) * low.radius
     for band, (least, most) in zip(bands, (first, last), strict=True):
         assert least - 1e-9 <= band <= most + 1e-9
+
+
+@pytest.mark.usefixtures("few_starts")
+def test_misfits_of_frames_do_not_depend_on_the_band() -> None:
+    images, truth = render("single-axis", "blobs", 2)
+    frames = Frames.from_array(images)
+    narrow, wide = (
+        joint.estimate_joint(frames, MotionConfig(band=band), time=truth.time, pixel_size=PIXEL).residual
+        for band in (14 / 3.4, 20 / 3.4)
+    )
+    assert np.median(narrow) == pytest.approx(np.median(wide), rel=0.1)

@@ -197,7 +197,7 @@ def _best_motion(
         fit = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
         assessment = model.assess(fit)
     if not certified(fit, assessment):
-        return _with_model_error(fit, assessment, finest)
+        return _with_model_error(fit, assessment)
     return fit, assessment
 
 
@@ -369,14 +369,14 @@ def _relative_noise(stack: Stack) -> float:
     return float(stack.centers.noise * area / np.nanmedian(stack.low.mass)) / 3
 
 
-def _with_model_error(fit: Fit, assessment: Assessment, band: float) -> tuple[Fit, Assessment]:
+def _with_model_error(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
     """Fit again with the noise of each mode raised to the misfit that was left, so that errors are honest.
 
     What an imperfect model leaves is much alike from group to group, and so many groups say it but once.
     """
     misfit = assessment.mode_misfit
     excess = np.where(misfit > 1, misfit * _alike(fit.normal.residual), 1.0)
-    model = ObjectModel.after(fit, replace(assessment, mode_misfit=excess), band)
+    model = ObjectModel.after(fit, replace(assessment, mode_misfit=excess), fit.model.band)
     again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
     honest = model.assess(again)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost, known=again.normal)

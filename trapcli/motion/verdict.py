@@ -26,6 +26,7 @@ _CERTIFIED = 1.06  # misfit per degree of freedom that pixel noise explains, whe
 _NOISE_ERROR = 0.03  # how well the noise is known
 _SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
+_STRONG = 12.0  # band times radius of the modes that misfits of frames are relative to
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 COARSE = np.deg2rad(1.0)
 """Error of R from which on the verdict mentions it."""
@@ -186,7 +187,9 @@ def to_motion(
         R = sigma @ R @ sigma
     rotated = judged & (unseen is None)
     center, T_errors = _centers(stack, fit, assessment)
-    size = np.sqrt(np.mean(np.abs(fit.low.modes) ** 2))
+    # whatever the band of the model: results with different ones are compared
+    strong = np.hypot(fit.low.k[:, 0], fit.low.k[:, 1]) * fit.low.radius <= _STRONG
+    size = np.sqrt(np.mean(np.abs(fit.low.modes[:, strong]) ** 2))
     residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
     return Motion(
         time=time,
