@@ -64,6 +64,10 @@ class LowBand:
     mass: Array
     radius: float
 
+    def inside(self, band: float) -> NDArray[np.bool_]:
+        """Tell which of the ``(K,)`` modes lie within `band` [rad / length]."""
+        return np.asarray(np.hypot(self.k[:, 0], self.k[:, 1]) <= band * (1 + 1e-9))
+
     def select(self, index: NDArray[np.intp]) -> LowBand:
         """Return the content of some frames."""
         return replace(

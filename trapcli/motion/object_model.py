@@ -157,7 +157,7 @@ class ObjectModel:
         variance: Array | None = None,
         weights: Array | None = None,
     ) -> None:
-        inside = np.hypot(low.k[:, 0], low.k[:, 1]) <= band * (1 + 1e-9)
+        inside = low.inside(band)
         self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
         self.band, self.guard = band, guard
         self.variance = np.full(inside.sum(), low.variance) if variance is None else variance[inside]

@@ -188,8 +188,8 @@ def to_motion(
     rotated = judged & (unseen is None)
     center, T_errors = _centers(stack, fit, assessment)
     # whatever the band of the model: results with different ones are compared
-    strong = np.hypot(fit.low.k[:, 0], fit.low.k[:, 1]) * fit.low.radius <= _STRONG
-    size = np.sqrt(np.mean(np.abs(fit.low.modes[:, strong]) ** 2))
+    strong = fit.low.modes[:, fit.low.inside(_STRONG / fit.low.radius)]
+    size = np.sqrt(np.mean(np.abs(strong) ** 2))
     residual = np.interp(time, fit.low.time, np.sqrt(assessment.frame_misfit * fit.low.variance)) / size
     return Motion(
         time=time,

@@ -88,19 +88,19 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
     path = path.near(spline, np.concatenate([spline.grid, views.low.time]))
     middle = np.median(center, axis=0)
     points = _Points.over(views.low, middle, _BAND)
-    odds, values = _pattern(views, path, points, _BAND)
+    odds, values = _pattern(views, path, points)
     if odds < _CONVINCING:
         return None
     for _ in range(_ROUNDS):
         model = ObjectModel(views.without(points.waves @ values), _BAND / low.radius)
         fit = model.fit(path, views.low.time, spline, steps=_STEPS)
         path, before = fit.path, values
-        _, values = _pattern(views.shifted(fit.shift), path, points, _BAND)
+        _, values = _pattern(views.shifted(fit.shift), path, points)
         change = np.linalg.norm(points.waves @ (values - before))
         if change < _SETTLED * np.linalg.norm(points.waves @ values):
             break
     points = _Points.over(low, middle, _FINEST_BAND)
-    _, values = _pattern(finest.shifted(fit.shift), path, points, _FINEST_BAND)
+    _, values = _pattern(finest.shifted(fit.shift), path, points)
     return points.image(values, frames.shape[1:], pixel_size)
 
 
@@ -137,7 +137,7 @@ class _Views:
 
     def within(self, band: float) -> _Views:
         """Leave out modes beyond `band` over the object's radius."""
-        kept = np.hypot(self.low.k[:, 0], self.low.k[:, 1]) * self.low.radius <= band
+        kept = self.low.inside(band / self.low.radius)
         low = replace(self.low, k=self.low.k[kept], modes=self.low.modes[:, kept])
         return _Views(low, self.phase[:, kept])
 
@@ -160,6 +160,8 @@ class _Points:
         ``(P, 2)``, from the frame's middle [length].
     radius:
         Of the object [length].
+    band:
+        Highest spatial frequency that tells them apart, times the radius.
     k:
         ``(K, 2)`` modes.
     waves:
@@ -168,6 +170,7 @@ class _Points:
 
     place: Array
     radius: float
+    band: float
     k: Array
     waves: ComplexArray
 
@@ -178,7 +181,7 @@ class _Points:
         axis = np.arange(-int(reach / spacing), int(reach / spacing) + 1) * spacing
         square = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         place = square[np.hypot(*square.T) <= reach] + middle
-        return cls(place, low.radius, low.k, np.exp(-1j * low.k @ place.T) * spacing**2 / (2 * np.pi))
+        return cls(place, low.radius, band, low.k, np.exp(-1j * low.k @ place.T) * spacing**2 / (2 * np.pi))
 
     def image(self, values: Array, shape: tuple[int, ...], pixel_size: float) -> Array:
         """Return the ``(H, W)`` image that has the modes of points of these values, and no others."""
@@ -193,9 +196,9 @@ class _Points:
         return np.asarray(np.where(near, image, 0.0))
 
 
-def _pattern(views: _Views, path: Path, points: _Points, band: float) -> tuple[float, Array]:
+def _pattern(views: _Views, path: Path, points: _Points) -> tuple[float, Array]:
     """Return the logarithm of the odds that there is a pattern, and the ``(P,)`` values of its points."""
-    told = _without_object(views, path.R[-len(views.phase) :], points, band)
+    told = _without_object(views, path.R[-len(views.phase) :], points)
     # where the motion or the model is wrong, what is left over is no pattern for that alone
     misfit = (told.square - told.likeliest().gain) / told.degrees
     told = told.doubted(max(1.0, misfit))
@@ -256,10 +259,10 @@ class _Told:
         return covariance @ self.pull, np.diagonal(covariance)
 
 
-def _without_object(views: _Views, R: Array, points: _Points, band: float) -> _Told:
+def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
     """Eliminate the object."""
     low = views.low
-    model = ObjectModel(low, band / low.radius)
+    model = ObjectModel(low, points.band / low.radius)
     seen = model.views(R)
     root = np.sqrt(conjugate_share(low.k) / low.variance)
     phase, modes = root * views.phase, root * low.modes
