@@ -86,7 +86,7 @@ def test_a_smooth_object_needs_a_coarser_lattice_than_a_sharp_one(path: Path) ->
     guards = []
     for width in (0.15 * RADIUS, 0.02 * RADIUS):
         blobs = Blobs(np.ones(6), place, np.tile(width**2 * np.eye(3), (6, 1, 1)))
-        guards.append(ObjectModel.simplest(low_band(blobs, path, 0), BAND, path.R).guard)
+        guards.append(ObjectModel.likeliest(low_band(blobs, path, 0), BAND, path.R).guard)
     assert guards[0] == GUARDS[0] < guards[1]
 
 

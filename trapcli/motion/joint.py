@@ -186,14 +186,14 @@ def _best_motion(
         new = [fit for fit in near if not any(_repeats(fit, other) for other in tried)]
         tried += new
         for rival in new:
-            fitted = _fine_fit(rival, ObjectModel.simplest(low, band, rival.R), smooth=not knots)
+            fitted = _fine_fit(rival, ObjectModel.likeliest(low, band, rival.R), smooth=not knots)
             best = min(best or fitted, fitted, key=lambda one: one[0].cost - one[1].degrees)
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
     fit, assessment = best
     if finest > band and fit.axes != (2,) and certified(fit, assessment):
-        model = ObjectModel(low, finest, guard=fit.model.guard)
+        model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         fit = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
         assessment = model.assess(fit)
     if not certified(fit, assessment):

@@ -30,11 +30,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from trapcli.motion.elimination import Eliminated, ObjectBlock, bent_blocks
 from trapcli.motion.fourier_slices import back_project, conjugate_share, gather, project, slice_points
 from trapcli.motion.integrate import interpolated
 from trapcli.motion.low_band import LowBand
+from trapcli.motion.object_prior import Prior
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
 from trapcli.threads import in_parallel
@@ -47,6 +49,11 @@ GUARDS = (3.0, 4.5, 6.0)
 
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
+_PRIOR_BAND = 12.0  # band times radius up to which the prior is told
+_TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
+_SPREAD = ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0))  # of the logarithms of both, at first
+_LOOKS = 20  # for the likeliest
+_LOOSE = 4.0  # edges are no samples of a prior, and must not be smoothed away where they are seen
 _PROBES = 2  # objects that are fitted to noise alone
 _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
@@ -142,6 +149,8 @@ class ObjectModel:
     guard:
         Half the gap between the band and its periodic image, times the object's radius: the wider, the finer
         the lattice, and the sharper the edges that it can show.
+    prior:
+        What the object may be like; None for amplitudes that are alike everywhere and larger than any seen.
     variance:
         ``(K,)`` noise of each mode of `low`, model error included; None for white noise.
     weights:
@@ -154,12 +163,13 @@ class ObjectModel:
         band: float,
         *,
         guard: float = GUARDS[-1],
+        prior: Prior | None = None,
         variance: Array | None = None,
         weights: Array | None = None,
     ) -> None:
         inside = low.inside(band)
         self.low = replace(low, k=low.k[inside], modes=low.modes[:, inside])
-        self.band, self.guard = band, guard
+        self.band, self.guard, self.prior = band, guard, prior
         self.variance = np.full(inside.sum(), low.variance) if variance is None else variance[inside]
         self.weights = np.ones(len(low.time)) if weights is None else weights
         self._share = conjugate_share(self.low.k)
@@ -178,11 +188,14 @@ class ObjectModel:
         self.position = self._index * self.spacing
         self._half_index = self._index[: len(self._index) // 2 + 1]  # one point of each opposite pair
         radial = np.hypot(self.low.k[:, 0], self.low.k[:, 1])
-        blob = np.exp(-0.5 * (_WIDTH * spacing * radial) ** 2)
-        power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
-        power = np.maximum(power - self.variance, 0.01 * self.variance)
-        # amplitudes of unit variance then give at least the power that is seen
-        self._blob = blob * np.sqrt(np.max(power / blob**2) / len(self._index))
+        if prior is None:
+            self._blob = self._seen_everywhere(np.exp(-0.5 * (_WIDTH * spacing * radial) ** 2))
+            precision = np.ones(len(self._index))
+        else:
+            self._blob = prior.spectrum(radial) / np.sqrt(len(self._index))
+            precision = 1 / prior.variance(self.position)
+        # of opposite points alike
+        self._precision = precision[: len(self._half_index)], precision[: len(self._half_index) - 1]
         self._gain = self._root * self._blob
         # places of differences and sums of lattice points among all, for one point of each opposite pair
         edge = 4 * self._half + 1
@@ -191,18 +204,24 @@ class ObjectModel:
         self._difference = flat[:, None] - flat[None, :] + middle
         self._sum = flat[:, None] + flat[None, :] + middle
 
+    def _seen_everywhere(self, blob: Array) -> Array:
+        """Scale a blob so that amplitudes of unit variance give at least the power that is seen."""
+        power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
+        power = np.maximum(power - self.variance, 0.01 * self.variance)
+        return np.asarray(blob * np.sqrt(np.max(power / blob**2) / len(self._index)))
+
     @classmethod
     def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:
         """Return the model whose noise is raised, mode by mode, to what a fit has left over."""
         variance = fit.low.variance * np.maximum(assessment.mode_misfit, 1.0)
-        return cls(fit.low, band, guard=fit.model.guard, variance=variance)
+        return cls(fit.low, band, guard=fit.model.guard, prior=fit.model.prior, variance=variance)
 
     @classmethod
-    def simplest(cls, low: LowBand, band: float, R: Array) -> ObjectModel:
-        """Return the model of the guard that explains ``(G, 3, 3)`` rotations with the fewest amplitudes.
+    def likeliest(cls, low: LowBand, band: float, R: Array) -> ObjectModel:
+        """Return the model that explains ``(G, 3, 3)`` rotations best, in as few amplitudes as it takes.
 
-        By Akaike's criterion (1974, DOI 10.1109/TAC.1974.1100705): a smooth object needs a coarser lattice
-        than one with sharp edges, and amplitudes that it does not need only follow the noise.
+        The guard is told by Akaike's criterion (1974, DOI 10.1109/TAC.1974.1100705): a smooth object needs a
+        coarser lattice than one with sharp edges. The prior is told by its evidence.
         """
 
         def surprise(model: ObjectModel) -> float:
@@ -210,7 +229,31 @@ class ObjectModel:
             return model._cost(views, model.low.modes) + 2 * views.seen
 
         models = [cls(low, band, guard=guard) for guard in GUARDS]
-        return models[int(np.argmin(in_parallel(surprise, models)))]
+        guard = models[int(np.argmin(in_parallel(surprise, models)))].guard
+        return cls(low, band, guard=guard, prior=cls._likeliest_prior(low, band, guard, R))
+
+    @classmethod
+    def _likeliest_prior(cls, low: LowBand, band: float, guard: float, R: Array) -> Prior:
+        about, band = Prior.of(low), min(band, _PRIOR_BAND / low.radius)
+
+        def prior(logarithms: Array) -> Prior:
+            width, power = np.exp(logarithms)
+            return replace(about, width=width * low.radius, power=power * about.power)
+
+        def surprise(logarithms: Array) -> float:
+            model = cls(low, band, guard=guard, prior=prior(logarithms))
+            views = model.views(R)
+            return model._cost(views, model.low.modes) + views.volume
+
+        start = np.log(_TYPICAL)
+        best = minimize(
+            surprise,
+            start,
+            method="Nelder-Mead",
+            options={"initial_simplex": start + _SPREAD, "xatol": 0.1, "fatol": 1.0, "maxfev": _LOOKS},
+        )
+        found = prior(best.x)
+        return replace(found, power=_LOOSE * found.power)
 
     @property
     def data_count(self) -> float:
@@ -287,8 +330,8 @@ class ObjectModel:
             gain, now = self._search(now, spline, step, still, follow, roughness)
             if gain < _CONVERGED:
                 break
-        low, cost = self.low.shifted(now.shift), now.solution.cost
-        return Fit(now.path, low, now.shift, spline, cost, roughness, axes, self, normal)
+        low, misfit = self.low.shifted(now.shift), self._misfit(now.solution)
+        return Fit(now.path, low, now.shift, spline, misfit, roughness, axes, self, normal)
 
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
@@ -401,20 +444,22 @@ class ObjectModel:
         even, odd = along + across, (along - across)[:-1, :-1]
         even[-1] *= np.sqrt(0.5)  # the point in the middle is its own opposite
         even[:, -1] *= np.sqrt(0.5)
-        for block in (even, odd):
-            block[np.diag_indices(len(block))] += 1.0
+        for block, precision in zip((even, odd), self._precision, strict=True):
+            block[np.diag_indices(len(block))] += precision
         blocks = [even.copy(), odd.copy()] if ObjectBlock.is_dense(len(self.position), 2 * len(R)) else None
         halves = in_parallel(_inverse_factor, (even, odd))
         # not the trace of N⁻¹ A Aᵀ, of which rounding would leave little
-        seen = float(sum(len(half) - np.vdot(half, half) for half in halves))
+        unseen = (np.sum(half**2, axis=0) @ own for half, own in zip(halves, self._precision, strict=True))
+        seen = float(len(self.position) - sum(unseen))
         return Views(R, points, halves, blocks, seen)
 
     def _seen_slopes(self, views: Views) -> Array:
         """Return the ``(G, 3)`` derivatives of ``views.seen`` by small rotations ε, ``R → R exp([ε]×)``.
 
-        d tr(1 − N⁻¹) = tr(N⁻² dN), a sum over differences of lattice points.
+        With D the precision of the prior d tr(1 − N⁻¹ D) = tr(N⁻¹ D N⁻¹ dN), a sum over differences of
+        lattice points.
         """
-        even, odd = in_parallel(_inverse_square, views.halves)
+        even, odd = in_parallel(_twice_inverse, views.halves, self._precision)
         odd = np.pad(odd, (0, 1))
         for lower in (even, odd):  # stands for both triangles
             lower[np.diag_indices(len(lower))] *= 0.5
@@ -470,6 +515,11 @@ class ObjectModel:
         right = self.right(views, self._root * modes)
         amplitude = views.solve(right)
         return _Solution(amplitude, self._square(modes) - float(right @ amplitude))
+
+    def _misfit(self, solution: _Solution) -> float:
+        """Return the squares of the residuals alone, without what the prior adds."""
+        parts = zip(_folded(solution.amplitude), self._precision, strict=True)
+        return solution.cost - float(sum(part**2 @ precision for part, precision in parts))
 
     def _state(self, views: Views, modes: ComplexArray) -> _State:
         """Solve for the object; return what the gradient needs."""
@@ -622,6 +672,11 @@ class Views:
     blocks: list[Array] | None
     seen: float
 
+    @property
+    def volume(self) -> float:
+        """Logarithm of the determinant of the object's normal matrix."""
+        return -2 * float(sum(np.log(np.diag(half)).sum() for half in self.halves))
+
     def solve(self, right: Array) -> Array:
         """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""
         halves = [half.T @ (half @ part) for half, part in zip(self.halves, _folded(right), strict=True)]
@@ -635,7 +690,7 @@ class Views:
 
 @dataclass(frozen=True)
 class _Solution:
-    """The object that fits a motion best, as ``(n,)`` amplitudes, and the misfit that it leaves."""
+    """The object that fits a motion best, as ``(n,)`` amplitudes, and its misfit to data and prior."""
 
     amplitude: Array
     cost: float
@@ -658,10 +713,11 @@ def _inverse_factor(block: Array) -> Array:
     return np.asarray(scipy.linalg.lapack.dtrtri(factor, lower=True, overwrite_c=True)[0])
 
 
-def _inverse_square(half: Array) -> Array:
-    """Return the lower triangle of N⁻², from the inverse of the lower Cholesky factor of N."""
+def _twice_inverse(half: Array, precision: Array) -> Array:
+    """Return the lower triangle of N⁻¹ D N⁻¹, from the inverse of the lower Cholesky factor of N."""
     lower, _ = scipy.linalg.lapack.dlauum(half, lower=True)
     lower += np.tril(lower, -1).T
+    lower *= np.sqrt(precision)
     return np.asarray(scipy.linalg.blas.dsyrk(1.0, lower, lower=True))
 
 

@@ -1,8 +1,10 @@
 """How fast ω(t) may change, found from the data: a penalty on its roughness, chosen by its evidence.
 
-The second differences of ω on a fine grid are taken to be Gaussian with a variance of their own, as in a
-smoothing spline; the variance is the one under which the data are likeliest, the motion integrated out in the
-quadratic approximation of the misfit. Errors then hold what the penalty may have smoothed away (Wahba 1983,
+The second differences of ω on a fine grid are taken to be Gaussian with a covariance of their own, as in a
+smoothing spline: a particle may turn unevenly about one axis and steadily about the others. The covariance is
+the one under which the data are likeliest, the motion integrated out in the quadratic approximation of the
+misfit: one search finds its size, expectation and maximization its shape (Dempster, Laird and Rubin 1977,
+DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have smoothed away (Wahba 1983,
 DOI 10.1111/j.2517-6161.1983.tb01239.x).
 """
 
@@ -21,12 +23,14 @@ from trapcli.motion.path import Path, Spline, cross_matrix
 Array = NDArray[np.float64]
 
 _RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
+_ROUNDS = 6  # of expectation and maximization, each time that the weight is told
+_ALIKE = 1.0  # second differences that are taken as seen beforehand, alike in all directions
 _FREE = 3  # for each axis: a constant rotation and an ω that is linear in time cost nothing
 
 
 @dataclass(frozen=True)
 class Roughness:
-    """``weight · |second differences of ω|²``, on the grid of a spline that bends the path.
+    """``weight · dᵀ shape d``, summed over the second differences d of ω on the grid of a spline.
 
     Paths hold the grid, followed by a number of other times, `after`.
 
@@ -35,30 +39,35 @@ class Roughness:
     spline:
         What bends the path.
     axes:
-        Lab axes about which the path is bent, out of 0, 1, 2; P coefficients in all.
+        Lab axes about which the path is bent, A out of 0, 1, 2; P coefficients in all.
     weight:
         In units of the misfit for second differences [rad].
+    shape:
+        ``(A, A)`` inverse of the covariance of second differences, with a determinant of 1; None for a
+        covariance that is alike in all directions.
     """
 
     spline: Spline
     axes: tuple[int, ...] = (0, 1, 2)
     weight: float = 0.0
+    shape: Array | None = None
 
     def penalty(self, path: Path, after: int) -> float:
         """Return what the path's roughness counts."""
-        return self.weight * float(np.sum(self._bend(path, after) ** 2))
+        return self.weight * float(np.sum((self._bend(path, after) @ self._root.T) ** 2))
 
     def uphill(self, path: Path, after: int) -> Array:
         """Return ``(P,)`` half the gradient of the penalty by the spline's coefficients."""
-        return np.asarray(self.weight * self._design(path, after).T @ self._bend(path, after))
+        design, bend = self._weighted(path, after)
+        return np.asarray(self.weight * design.T @ bend)
 
     def curvature(self, path: Path, after: int) -> Array:
         """Return ``(P, P)`` half the Hessian of the penalty."""
-        design = self._design(path, after)
+        design, _ = self._weighted(path, after)
         return np.asarray(self.weight * design.T @ design)
 
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
-        """Return the roughness with the weight under which the data are likeliest.
+        """Return the roughness with the weight and shape under which the data are likeliest.
 
         Parameters
         ----------
@@ -66,9 +75,17 @@ class Roughness:
             ``(P, P)``, positive definite, and ``(P,)``: bending by x changes the misfit,
             minus twice a log-likelihood, by ``xᵀ hessian x − 2 downhill · x``.
         """
-        bend, design = self._bend(path, after), self._design(path, after)
+        roughness = self._alike(hessian, downhill, path, after)
+        for _ in range(_ROUNDS if len(self.axes) > 1 else 0):
+            roughness = roughness._likelier(hessian, downhill, path, after)
+        return roughness
+
+    def _alike(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+        """Return the roughness that is alike in all directions, with the likeliest weight."""
+        alike = replace(self, shape=None)
+        design, bend = alike._weighted(path, after)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
-        rank = max(len(hessian) - _FREE * len(self.axes), 1)
+        rank = len(self.axes) * self._rank(hessian)
         unit = float(np.trace(hessian) / np.trace(curvature))
 
         def surprise(decade: float) -> float:
@@ -81,19 +98,54 @@ class Roughness:
             return float(weight * square - gained @ gained + volume - rank * np.log(weight))
 
         best: Any = minimize_scalar(surprise, bounds=_RANGE, method="bounded", options={"xatol": 0.05})
-        return replace(self, weight=unit * 10.0 ** float(best.x))
+        return replace(alike, weight=unit * 10.0 ** float(best.x))
+
+    def _likelier(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+        """Return the roughness with the covariance that second differences are expected to have."""
+        design, bend = self._weighted(path, after)
+        factor = scipy.linalg.cholesky(
+            hessian + self.weight * design.T @ design, lower=True, check_finite=False
+        )
+        step = scipy.linalg.cho_solve((factor, True), downhill - self.weight * design.T @ bend)
+        spread = scipy.linalg.solve_triangular(factor, design.T, lower=True, check_finite=False)
+        axes = len(self.axes)
+        expected = (bend + design @ step).reshape(-1, axes)
+        spread = spread.reshape(-1, axes)
+        back = np.linalg.inv(self._root)
+        covariance = back @ (expected.T @ expected + spread.T @ spread) @ back.T
+        covariance += _ALIKE / self._rank(hessian) * np.trace(covariance) / axes * np.eye(axes)
+        covariance /= self._rank(hessian) + _ALIKE
+        size = float(np.linalg.det(covariance)) ** (1 / axes)
+        return replace(self, weight=1 / size, shape=size * np.linalg.inv(covariance))
+
+    def _rank(self, hessian: Array) -> float:
+        """Return how many second differences of each component the P coefficients decide."""
+        return max(len(hessian) / len(self.axes) - _FREE, 1.0)
+
+    @property
+    def _root(self) -> Array:
+        """``(A, A)`` matrix B with ``shape = BᵀB``."""
+        axes = len(self.axes)
+        return np.eye(axes) if self.shape is None else np.asarray(np.linalg.cholesky(self.shape).T)
+
+    def _weighted(self, path: Path, after: int) -> tuple[Array, Array]:
+        """Return second differences in units in which they are alike, and their derivatives, ``(·, P)``."""
+        design, bend = self._design(path, after), self._bend(path, after)
+        design = np.einsum("ij,tjp->tip", self._root, design, optimize=True)
+        return design.reshape(-1, design.shape[-1]), (bend @ self._root.T).ravel()
 
     def _bend(self, path: Path, after: int) -> Array:
-        return np.asarray((self._difference() @ self._omega(path, after)).ravel())
+        """Return the ``(T, A)`` second differences of ω along the axes."""
+        return np.asarray(self._difference() @ self._omega(path, after)[:, list(self.axes)])
 
     def _design(self, path: Path, after: int) -> Array:
-        """Return the derivatives of the second differences by the spline's coefficients."""
-        grid, omega = self.spline.grid, self._omega(path, after)
+        """Return ``(T, A, P)`` derivatives of the second differences by the spline's coefficients."""
+        grid, omega, axes = self.spline.grid, self._omega(path, after), list(self.axes)
         change = np.einsum("mb,ij->mibj", self.spline.slopes(grid), np.eye(3))
         # δω = δ' + ω × δ
         change += np.einsum("mij,mb->mibj", cross_matrix(omega), self.spline.values(grid))
-        rough = np.tensordot(self._difference(), change[..., list(self.axes)], (1, 0))
-        return np.asarray(rough.reshape(3 * len(rough), -1))
+        rough = np.tensordot(self._difference(), change[:, axes][..., axes], (1, 0))
+        return np.asarray(rough.reshape(*rough.shape[:2], -1))
 
     def _difference(self) -> Array:
         grid = self.spline.grid
