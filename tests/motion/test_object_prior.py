@@ -1,0 +1,111 @@
+"""What the frames tell of an object before its motion is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tests.motion.test_object_model import (
+    BAND,
+    FINE_BAND,
+    FRAMES,
+    KNOTS,
+    RADIUS,
+    TUMBLING,
+    low_band,
+    on_grid,
+    turned,
+)
+from trapcli.motion.object_model import ObjectModel
+from trapcli.motion.object_prior import Prior, radial_density
+from trapcli.motion.path import Path, Spline, align
+from trapcli.simulation.phantoms import Blobs
+
+Array = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def path() -> Path:
+    time = np.linspace(0, 1, FRAMES)
+    return Path(time, TUMBLING.rotations(time), TUMBLING.omega(time))
+
+
+def round_blob(width: float) -> Blobs:
+    return Blobs(np.ones(1), np.zeros((1, 3)), width**2 * np.eye(3)[None])
+
+
+@pytest.mark.parametrize("width", [0.12, 0.2])
+def test_the_radial_density_of_a_gaussian_is_a_gaussian(path: Path, width: float) -> None:
+    low = low_band(round_blob(width * RADIUS), path, 0, band=4 * FINE_BAND, noise=1e-5)
+    distance = np.linspace(0, RADIUS, 30)
+    density = radial_density(low, distance)
+    smoothed = np.hypot(width, 0.08) * RADIUS
+    assert density / density[0] == pytest.approx(np.exp(-0.5 * (distance / smoothed) ** 2), abs=0.02)
+
+
+def test_amplitudes_are_expected_where_the_object_is(path: Path) -> None:
+    prior = Prior.of(low_band(round_blob(0.2 * RADIUS), path, 0, band=FINE_BAND))
+    assert (np.diff(prior.density) <= 0).all()
+    position = RADIUS * np.random.default_rng(0).uniform(-0.8, 0.8, (500, 3))
+    variance = prior.variance(position)
+    assert variance.mean() == pytest.approx(1)
+    distance = np.linalg.norm(position, axis=1)
+    assert variance[distance < 0.25 * RADIUS].min() > 10 * variance[distance > 0.7 * RADIUS].max()
+
+
+def test_a_hollow_object_may_hold_something_inside(path: Path) -> None:
+    low = low_band(round_blob(0.3 * RADIUS), path, 0, band=FINE_BAND, noise=1e-5)
+    hole = low_band(round_blob(0.15 * RADIUS), path, 0, band=FINE_BAND, noise=1e-5)
+    hollow = low.modes / low.modes[0, 0].real - 0.9 * hole.modes / hole.modes[0, 0].real
+    low.modes[:] = hollow
+    prior = Prior.of(low)
+    assert prior.density[0] == 1
+
+
+def test_the_prior_of_a_smooth_object_has_wider_blobs(path: Path) -> None:
+    widths = []
+    rng = np.random.default_rng(5)
+    place = rng.normal(size=(12, 3))
+    place *= 0.6 * RADIUS / np.linalg.norm(place, axis=1).max()
+    for width in (0.06, 0.15):
+        blobs = Blobs(rng.uniform(0.4, 1, 12), place, np.tile((width * RADIUS) ** 2 * np.eye(3), (12, 1, 1)))
+        model = ObjectModel.likeliest(low_band(blobs, path, 0, band=FINE_BAND), FINE_BAND, path.R)
+        assert model.prior is not None
+        widths.append(model.prior.width / RADIUS)
+    assert widths[1] > 2 * widths[0]
+    assert widths[1] == pytest.approx(0.15, rel=0.5)
+
+
+def test_the_slopes_of_what_the_frames_see_with_a_prior(path: Path) -> None:
+    thing = Blobs.random(np.random.default_rng(1), radius=RADIUS)
+    low = low_band(thing, path, 3, noise=0.05)
+    model = ObjectModel.likeliest(low, BAND, path.R)
+    slopes, h = model._seen_slopes(model.views(path.R)), 3e-5
+    turn = np.random.default_rng(0).normal(size=(FRAMES, 3))
+    after, before = (model.views(turned(path.R, sign * h * turn)).seen for sign in (1, -1))
+    assert (after - before) / (2 * h) == pytest.approx(np.sum(slopes * turn), rel=1e-4)
+
+
+def test_the_misfit_is_that_of_the_data_alone(path: Path) -> None:
+    thing = Blobs.random(np.random.default_rng(2), radius=RADIUS)
+    low = low_band(thing, path, 2, noise=0.02)
+    model = ObjectModel.likeliest(low, BAND, path.R)
+    fit = model.fit(on_grid(path, Spline(0.0, 1.0, KNOTS)), path.time, Spline(0.0, 1.0, KNOTS))
+    assert fit.cost == pytest.approx(np.sum(np.abs(fit.normal.residual) ** 2), rel=1e-3)
+    assert fit.cost / model.assess(fit).degrees == pytest.approx(1, abs=0.06)
+
+
+@pytest.mark.slow
+def test_a_prior_lessens_the_errors_of_noisy_motions(path: Path) -> None:
+    errors = []
+    spline = Spline(0.0, 1.0, 12)
+    for seed in range(10):
+        thing = Blobs.random(np.random.default_rng(seed), radius=RADIUS)
+        low = low_band(thing, path, seed, band=FINE_BAND, noise=0.02)
+        likely = ObjectModel.likeliest(low, FINE_BAND, path.R)
+        for model in (ObjectModel(low, FINE_BAND, guard=likely.guard), likely):
+            fit = model.fit(on_grid(path, spline), path.time, spline)
+            errors.append(align(fit.path.R[-FRAMES:], path.R)[0].mean())
+    without, with_prior = np.reshape(errors, (-1, 2)).mean(axis=0)
+    assert with_prior < 0.9 * without

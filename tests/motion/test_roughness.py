@@ -1,0 +1,85 @@
+"""How rough ω is, found from the data: alike or not in all directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from trapcli.motion.path import Path, Spline
+from trapcli.motion.roughness import Roughness
+
+Array = NDArray[np.float64]
+SPLINE = Spline(0.0, 1.0, 40)
+ERROR = 1e-3  # of the angles at each time [rad]
+
+
+def still() -> Path:
+    grid = SPLINE.grid
+    return Path(grid, np.tile(np.eye(3), (len(grid), 1, 1)), np.zeros((len(grid), 3)))
+
+
+def measured(angles: Array, seed: int) -> tuple[Array, Array]:
+    """Return Hessian and gradient of the misfit to noisy small ``(N, 3)`` angles."""
+    noisy = angles + ERROR * np.random.default_rng(seed).normal(size=angles.shape)
+    values = SPLINE.values(np.linspace(0, 1, len(angles)))
+    return np.kron(values.T @ values, np.eye(3)) / ERROR**2, (values.T @ noisy).ravel() / ERROR**2
+
+
+def uneven(time: Array) -> Array:
+    """Return small angles that change unevenly about the second axis alone."""
+    return np.stack([0.01 * time, np.sin(9 * time), -0.02 * time], axis=1)
+
+
+def test_directions_of_steady_rotation_are_told_from_that_of_an_uneven_one() -> None:
+    time = np.linspace(0, 1, 200)
+    found = Roughness(SPLINE).weighed(*measured(uneven(time), 0), still(), 0)
+    assert found.shape is not None
+    assert np.linalg.det(found.shape) == pytest.approx(1)
+    stiffness = np.diag(found.shape)
+    assert min(stiffness[0], stiffness[2]) > 5 * stiffness[1]
+
+
+def test_a_shape_errs_less_about_the_axes_that_are_steady() -> None:
+    time, errors = np.linspace(0, 1, 200), []
+    values = SPLINE.values(time)
+    for seed in range(20):
+        hessian, downhill = measured(uneven(time), seed)
+        free = Roughness(SPLINE)
+        for roughness in (
+            free._alike(hessian, downhill, still(), 0),
+            free.weighed(hessian, downhill, still(), 0),
+        ):
+            step = np.linalg.solve(hessian + roughness.curvature(still(), 0), downhill)
+            errors.append(np.mean((values @ step.reshape(-1, 3) - uneven(time)) ** 2, axis=0))
+    alike_error, shaped_error = np.reshape(errors, (-1, 2, 3)).mean(axis=0)
+    assert (shaped_error[[0, 2]] < 0.8 * alike_error[[0, 2]]).all()
+    assert shaped_error.mean() < 0.9 * alike_error.mean()
+
+
+def test_the_shape_turns_with_the_axes() -> None:
+    time, turn = np.linspace(0, 1, 200), np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    values = SPLINE.values(time)
+    hessian, downhill = measured(uneven(time), 1)
+    shape = Roughness(SPLINE).weighed(hessian, downhill, still(), 0).shape
+    turned = (downhill.reshape(-1, 3) @ turn.T).ravel()
+    assert len(downhill) == 3 * values.shape[1]
+    assert Roughness(SPLINE).weighed(hessian, turned, still(), 0).shape == pytest.approx(
+        turn @ shape @ turn.T, rel=1e-3, abs=1e-3 * np.abs(shape).max()
+    )
+
+
+def test_the_penalty_has_its_gradient_and_curvature() -> None:
+    rng = np.random.default_rng(2)
+    grid = SPLINE.grid
+    path = Path(grid, np.tile(np.eye(3), (len(grid), 1, 1)), rng.normal(size=(len(grid), 3)))
+    root = rng.normal(size=(3, 3))
+    roughness = Roughness(SPLINE, weight=2.0, shape=root @ root.T)
+    bend, h = rng.normal(size=(SPLINE.size, 3)), 1e-6
+    up, down = (roughness.penalty(path.bent(SPLINE, sign * h * bend), 0) for sign in (1, -1))
+    assert (up - down) / (4 * h) == pytest.approx(roughness.uphill(path, 0) @ bend.ravel(), rel=1e-5)
+    # for ω = 0 the penalty is quadratic in small bends
+    bent = still().bent(SPLINE, 1e-6 * bend)
+    assert roughness.penalty(bent, 0) == pytest.approx(
+        1e-12 * bend.ravel() @ roughness.curvature(still(), 0) @ bend.ravel(), rel=1e-4
+    )
