@@ -48,7 +48,7 @@ GUARDS = (3.0, 4.5, 6.0)
 """Guards of the lattice that are tried, see `ObjectModel`."""
 
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
-_WIDTH = 0.4  # standard deviation of a blob in units of `spacing`
+_WIDTH = 0.4  # standard deviation of a blob in units of `spacing`, where it is not known
 _PRIOR_BAND = 12.0  # band times radius up to which the prior is told
 _TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
 _SPREAD = ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0))  # of the logarithms of both, at first
@@ -150,7 +150,7 @@ class ObjectModel:
         Half the gap between the band and its periodic image, times the object's radius: the wider, the finer
         the lattice, and the sharper the edges that it can show.
     prior:
-        What the object may be like; None for amplitudes that are alike everywhere and larger than any seen.
+        What the object may be like; None where that is not known.
     variance:
         ``(K,)`` noise of each mode of `low`, model error included; None for white noise.
     weights:
@@ -188,12 +188,9 @@ class ObjectModel:
         self.position = self._index * self.spacing
         self._half_index = self._index[: len(self._index) // 2 + 1]  # one point of each opposite pair
         radial = np.hypot(self.low.k[:, 0], self.low.k[:, 1])
-        if prior is None:
-            self._blob = self._seen_everywhere(np.exp(-0.5 * (_WIDTH * spacing * radial) ** 2))
-            precision = np.ones(len(self._index))
-        else:
-            self._blob = prior.spectrum(radial) / np.sqrt(len(self._index))
-            precision = 1 / prior.variance(self.position)
+        expected = prior or Prior.vague(self.low, _WIDTH * spacing, self.variance)
+        self._blob = expected.spectrum(radial) / np.sqrt(len(self._index))
+        precision = 1 / expected.variance(self.position)
         # of opposite points alike
         self._precision = precision[: len(self._half_index)], precision[: len(self._half_index) - 1]
         self._gain = self._root * self._blob
@@ -203,12 +200,6 @@ class ObjectModel:
         middle = 2 * self._half * (edge**2 + edge + 1)
         self._difference = flat[:, None] - flat[None, :] + middle
         self._sum = flat[:, None] + flat[None, :] + middle
-
-    def _seen_everywhere(self, blob: Array) -> Array:
-        """Scale a blob so that amplitudes of unit variance give at least the power that is seen."""
-        power = np.mean(np.abs(self.low.modes) ** 2, axis=0)
-        power = np.maximum(power - self.variance, 0.01 * self.variance)
-        return np.asarray(blob * np.sqrt(np.max(power / blob**2) / len(self._index)))
 
     @classmethod
     def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:

@@ -51,6 +51,16 @@ class Prior:
         power = float(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)))
         return cls(distance, np.maximum(density / density[0], _LEAST), 0.0, power)
 
+    @classmethod
+    def vague(cls, low: LowBand, width: float, noise: Array) -> Prior:
+        """Return a prior that is alike everywhere and expects at least what is seen.
+
+        Of blobs of a `width` [length]; with the ``(K,)`` variances of the modes' noise.
+        """
+        seen = np.mean(np.abs(low.modes) ** 2, axis=0)
+        power = np.maximum(seen - noise, 0.01 * noise) * np.exp(np.sum((width * low.k) ** 2, axis=1))
+        return cls(np.zeros(1), np.ones(1), width, float(power.max()))
+
     def variance(self, position: Array) -> Array:
         """Return ``(n,)`` variances of the amplitudes at ``(n, 3)`` places, 1 on the average."""
         variance = np.interp(np.linalg.norm(position, axis=1), self.distance, self.density)
