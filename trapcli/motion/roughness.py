@@ -58,12 +58,12 @@ class Roughness:
 
     def uphill(self, path: Path, after: int) -> Array:
         """Return ``(P,)`` half the gradient of the penalty by the spline's coefficients."""
-        design, bend = self._weighted(path, after)
+        design, bend = self._weighted(self._design(path, after), self._bend(path, after))
         return np.asarray(self.weight * design.T @ bend)
 
     def curvature(self, path: Path, after: int) -> Array:
         """Return ``(P, P)`` half the Hessian of the penalty."""
-        design, _ = self._weighted(path, after)
+        design, _ = self._weighted(self._design(path, after), self._bend(path, after))
         return np.asarray(self.weight * design.T @ design)
 
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
@@ -75,15 +75,16 @@ class Roughness:
             ``(P, P)``, positive definite, and ``(P,)``: bending by x changes the misfit,
             minus twice a log-likelihood, by ``xᵀ hessian x − 2 downhill · x``.
         """
-        roughness = self._alike(hessian, downhill, path, after)
+        design, bend = self._design(path, after), self._bend(path, after)
+        roughness = self._alike(hessian, downhill, design, bend)
         for _ in range(_ROUNDS if len(self.axes) > 1 else 0):
-            roughness = roughness._likelier(hessian, downhill, path, after)
+            roughness = roughness._likelier(hessian, downhill, design, bend)
         return roughness
 
-    def _alike(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+    def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness that is alike in all directions, with the likeliest weight."""
         alike = replace(self, shape=None)
-        design, bend = alike._weighted(path, after)
+        design, bend = alike._weighted(design, bend)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
         rank = len(self.axes) * self._rank(hessian)
         unit = float(np.trace(hessian) / np.trace(curvature))
@@ -100,9 +101,9 @@ class Roughness:
         best: Any = minimize_scalar(surprise, bounds=_RANGE, method="bounded", options={"xatol": 0.05})
         return replace(alike, weight=unit * 10.0 ** float(best.x))
 
-    def _likelier(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+    def _likelier(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness with the covariance that second differences are expected to have."""
-        design, bend = self._weighted(path, after)
+        design, bend = self._weighted(design, bend)
         factor = scipy.linalg.cholesky(
             hessian + self.weight * design.T @ design, lower=True, check_finite=False
         )
@@ -128,9 +129,8 @@ class Roughness:
         axes = len(self.axes)
         return np.eye(axes) if self.shape is None else np.asarray(np.linalg.cholesky(self.shape).T)
 
-    def _weighted(self, path: Path, after: int) -> tuple[Array, Array]:
-        """Return second differences in units in which they are alike, and their derivatives, ``(·, P)``."""
-        design, bend = self._design(path, after), self._bend(path, after)
+    def _weighted(self, design: Array, bend: Array) -> tuple[Array, Array]:
+        """Return ``(T A, P)`` derivatives and ``(T A,)`` differences in units in which these are alike."""
         design = np.einsum("ij,tjp->tip", self._root, design, optimize=True)
         return design.reshape(-1, design.shape[-1]), (bend @ self._root.T).ravel()
 
