@@ -31,6 +31,8 @@ _FAINT = 2.0  # standard deviations below which α does not differ from 0
 COARSE = np.deg2rad(1.0)
 """Error of R from which on the verdict mentions it."""
 
+_OPEN = np.deg2rad(10.0)  # error of R, by the curvature of the misfit, up to which curvature tells it
+
 _TOUCHED = 0.1  # share of an unseen turn in a component of ω that makes it unknown
 
 
@@ -166,13 +168,15 @@ def to_motion(
     flags[rates.aimless] |= np.uint16(Flag.AMBIGUOUS_PHI)
     flags[rates.void] |= np.uint16(Flag.THIRD_ORDER_SILENT)
     valid = judged & (flags & np.uint16(Flag.OUTLIER | Flag.BLANK) == 0)
-    identifiable = verdict.identifiable and unseen is None and bool(valid.mean() > 0.5)
+    open_by = np.sqrt(np.mean(np.sum(R_errors[stack.seen] ** 2, axis=1)))
+    told = valid.mean() > 0.5 and open_by <= _OPEN
+    identifiable = verdict.identifiable and unseen is None and bool(told)
     text = verdict.text
     if unseen is not None:
         text = unseen.text
     elif verdict.identifiable and not identifiable:
         text = (
-            "the images leave the rotation open by more than 20 degrees: "
+            f"the images leave the rotation open by more than {np.rad2deg(_OPEN):.0f} degrees: "
             "a symmetric object, too much noise or too little rotation"
         )
     elif identifiable and (largest := float(np.linalg.norm(R_errors[valid], axis=1).max())) > COARSE:
