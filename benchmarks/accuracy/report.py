@@ -226,8 +226,8 @@ def _curve(results: Result, curve: Curve) -> str:
     lines = [
         f"### {curve.title}",
         "",
-        f"{made.frames} frames of {made.height} × {made.width}; objects, motions and noises: {len(seeds)}, the "
-        "first of them for other methods than `auto`.",
+        f"{made.frames} frames of {made.height} × {made.width}; objects, motions and noises: {len(seeds)}, "
+        "the first of them for other methods than `auto`.",
         "",
         "| noise | Cramér–Rao bound | " + " | ".join(COLUMNS[m] for m in present) + " |",
         "|---" * (len(present) + 2) + "|",
@@ -326,7 +326,8 @@ row, seeds 7 and 9, these lower the bound from 0.057° to 0.050° and from 0.073
 
 The estimate may err less than that: it does not take the object for anything whatever, but for what the mean
 of all frames shows of it and for as smooth as their evidence says ([theory](theory.md)). For three scenes of
-the camera's row at 5 % the errors that are stated would be 0.45 to 0.63 of what they are were the object known."""
+the camera's row at 5 % the errors that are stated would be 0.45 to 0.63 of what they are were the object
+known."""
 
 
 def _how(results: Result) -> str:
