@@ -194,8 +194,10 @@ def _best_motion(
     fit, assessment = best
     if finest > band and fit.axes != (2,) and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
-        fit = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
-        assessment = model.assess(fit)
+        finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
+        # a prior told at low frequencies may be wrong so far beyond
+        if certified(finer, told := model.assess(finer)):
+            fit, assessment = finer, told
     if not certified(fit, assessment):
         return _with_model_error(fit, assessment)
     return fit, assessment
