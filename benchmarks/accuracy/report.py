@@ -255,11 +255,11 @@ def _better(results: Result, curve: Curve) -> list[str]:
     """Say by how much `auto` is better than the best of ASPIRE, on ASPIRE's frames."""
     lines = []
     for name, words in (("single", "single frames"), ("averaged", "frames averaged with their neighbours")):
+        peers = [m for m in COLUMNS if m.endswith(f"/{name}")]
         ratios = []
         for noise in NOISE:
-            peers = [m for m in COLUMNS if m.endswith(f"/{name}")]
-            theirs = {m: _average(_runs(results, curve, noise, m)) for m in peers}
-            best = min((average[0] for average in theirs.values() if average), default=None)
+            theirs = [_average(_runs(results, curve, noise, m)) for m in peers]
+            best = min((average[0] for average in theirs if average), default=None)
             shared = _seeds_of(results, curve, noise, peers)
             ours = [results["runs"].get(f"{curve.key}/{seed}/{noise:g}/auto", {}) for seed in shared]
             if best is not None and ours and all(run.get("mean_of_60") is not None for run in ours):

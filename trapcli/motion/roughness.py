@@ -54,16 +54,16 @@ class Roughness:
 
     def penalty(self, path: Path, after: int) -> float:
         """Return what the path's roughness counts."""
-        return self.weight * float(np.sum((self._bend(path, after) @ self._root.T) ** 2))
+        return self.weight * float(np.sum(self._weighted(self._bend(path, after)) ** 2))
 
     def uphill(self, path: Path, after: int) -> Array:
         """Return ``(P,)`` half the gradient of the penalty by the spline's coefficients."""
-        design, bend = self._weighted(self._design(path, after), self._bend(path, after))
+        design, bend = self._weighted(self._design(path, after)), self._weighted(self._bend(path, after))
         return np.asarray(self.weight * design.T @ bend)
 
     def curvature(self, path: Path, after: int) -> Array:
         """Return ``(P, P)`` half the Hessian of the penalty."""
-        design, _ = self._weighted(self._design(path, after), self._bend(path, after))
+        design = self._weighted(self._design(path, after))
         return np.asarray(self.weight * design.T @ design)
 
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
@@ -84,7 +84,7 @@ class Roughness:
     def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness that is alike in all directions, with the likeliest weight."""
         alike = replace(self, shape=None)
-        design, bend = alike._weighted(design, bend)
+        design, bend = alike._weighted(design), alike._weighted(bend)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
         rank = len(self.axes) * self._rank(hessian)
         unit = float(np.trace(hessian) / np.trace(curvature))
@@ -103,7 +103,7 @@ class Roughness:
 
     def _likelier(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness with the covariance that second differences are expected to have."""
-        design, bend = self._weighted(design, bend)
+        design, bend = self._weighted(design), self._weighted(bend)
         factor = scipy.linalg.cholesky(
             hessian + self.weight * design.T @ design, lower=True, check_finite=False
         )
@@ -129,10 +129,10 @@ class Roughness:
         axes = len(self.axes)
         return np.eye(axes) if self.shape is None else np.asarray(np.linalg.cholesky(self.shape).T)
 
-    def _weighted(self, design: Array, bend: Array) -> tuple[Array, Array]:
-        """Return ``(T A, P)`` derivatives and ``(T A,)`` differences in units in which these are alike."""
-        design = np.einsum("ij,tjp->tip", self._root, design, optimize=True)
-        return design.reshape(-1, design.shape[-1]), (bend @ self._root.T).ravel()
+    def _weighted(self, differences: Array) -> Array:
+        """Return ``(T, A, ...)`` differences, or derivatives of them, as ``(T A, ...)`` that are alike."""
+        alike = np.einsum("ij,tj...->ti...", self._root, differences, optimize=True)
+        return np.asarray(alike.reshape(-1, *differences.shape[2:]))
 
     def _bend(self, path: Path, after: int) -> Array:
         """Return the ``(T, A)`` second differences of ω along the axes."""
