@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from trapcli.config import MotionConfig
-from trapcli.motion import joint
+from trapcli.motion import joint, verdict
 from trapcli.motion.branch import find_branches
 from trapcli.motion.path import align
 from trapcli.result.motion import Flag, Motion
@@ -35,6 +35,16 @@ def estimate(images: np.ndarray, time: np.ndarray) -> Motion:
 def few_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search less: the branch is not what is tested."""
     monkeypatch.setattr(joint, "find_branches", partial(find_branches, starts=8, keep=3))
+
+
+def test_a_rotation_that_is_left_open_is_not_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    images, truth = scene(tilt=20.0)
+    assert estimate(images, truth.time).identifiable
+    monkeypatch.setattr(verdict, "_OPEN", 1e-6)
+    found = estimate(images, truth.time)
+    assert not found.identifiable
+    assert "leave the rotation open" in found.verdict
+    assert not found.valid.any()
 
 
 @pytest.mark.slow
