@@ -333,7 +333,7 @@ def main() -> None:
     parser.add_argument("patterns", nargs="*", default=["*"])
     parser.add_argument("--again", action="store_true", help="also rows that have been measured")
     parser.add_argument("--cell", type=Path, default=CELL, help="the wave-optics simulation of a cell")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path, default=RESULTS, help="elsewhere: no page is written")
     parser.add_argument("--report", action="store_true", help="only write the page")
     options = parser.parse_args()
     results = json.loads(options.results.read_text()) if options.results.exists() else {}
@@ -349,7 +349,8 @@ def main() -> None:
         results[row.name] = measured = measure(row)
         print(row.name, json.dumps(measured, ensure_ascii=False), file=sys.stderr, flush=True)
         options.results.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
-    write_page({row.name: results[row.name] for row in rows if row.name in results}, PAGE)
+    if options.results == RESULTS:
+        write_page({row.name: results[row.name] for row in rows if row.name in results}, PAGE)
 
 
 if __name__ == "__main__":
