@@ -176,3 +176,23 @@ def test_noise_whose_high_frequencies_a_codec_has_cut(cut: bool) -> None:
     noise = 0.05 * rng.standard_normal((4, 128, 128))
     images = ball + np.fft.irfft2(np.fft.rfft2(noise) * kept, (128, 128))
     assert pixel_noise(images) == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(("jitter", "drift"), [(0.1, 3.0), (0.0, 3.0), (0.1, 0.0)])
+def test_a_particle_that_is_shaken_while_it_drifts(
+    jitter: float, drift: float, render, blobs
+) -> None:  # type: ignore[no-untyped-def]
+    pixel, frames = 0.25, 150
+    rng = np.random.default_rng(1)
+    slow = drift * np.sin(np.linspace(0, 5, frames))[:, None] * [1.0, -0.5]
+    place = pixel * (slow + jitter * rng.standard_normal((frames, 2)))
+    x = (np.arange(64) - 32) * pixel
+    centre = blobs.center[:2]
+    clean = np.array([blobs.project(np.eye(3), blobs.center * 0 - [*p, 0], x, x) for p in place])
+    noise = 0.05
+    found = centers_of(clean + noise * clean.max() * rng.standard_normal(clean.shape), pixel)
+    pull = (found.center - centre - place) / found.errors
+    assert 0.8 < np.sqrt(np.mean(pull**2)) < 1.25
+    # what is smooth is told better by all frames together, what is not by each alone
+    alone = centers_of(clean[:2] + noise * clean.max() * rng.standard_normal(clean[:2].shape), pixel)
+    assert (np.median(found.errors) < 0.5 * np.median(alone.errors)) == (jitter == 0)

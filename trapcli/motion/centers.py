@@ -50,6 +50,9 @@ _FEWEST_BLOCKS = 4  # along an edge of the frame
 _EVEN = (0.2, 0.35), (0.35, 0.5)  # bands that a codec leaves as they are, in units of the highest frequency
 _ALIKE = 1.3  # ratio of the noise's power in the two
 _CUT = 1.5  # power in them, in units of that in the corners, that shows a codec at work
+_CHI_SQUARE_MEDIAN = 0.4549, 1.061  # of one degree of freedom, and √M times its error in M samples
+_SHAKEN = 3.0  # standard deviations by which centres must scatter more than their noise
+_EXACT = 1e-3  # share of its noise that a frame's centre keeps at least away from a smooth curve
 _RIM = 16  # part of the shorter edge that a frame's rim is wide
 _LEAST_RIM = 8  # its width at least [pixels]
 _INDEPENDENT = 0.85  # noise of the change at the rim, in units of that of independent frames
@@ -431,9 +434,27 @@ def _smooth(center: Array, mass: Array, moment_noise: float) -> tuple[Array, Arr
         smooth = smoother.apply(center, 1.0)
         judged = np.isfinite(smooth).all(axis=1) & seen
         errors[seen] = noise
-        errors[judged] = noise * smoother.gains(len(center))[judged, None]
-        center = np.where(judged[:, None], smooth, center)
+        # of a projection, the noise that is left is its weight of the frame itself
+        gain = smoother.gains(len(center))[judged, None] ** 2
+        rest = center[judged] - smooth[judged]
+        shaken = _shaken(rest / np.sqrt(np.maximum(1 - gain, _EXACT)), noise)
+        errors[judged] = noise * np.sqrt(shaken + (1 - shaken) * gain)
+        center[judged] = smooth[judged] + shaken * rest
     return center, errors
+
+
+def _shaken(rest: Array, noise: float) -> float:
+    """Return which share of ``(M, 2)`` independent rests of the smoothed centres is motion, not noise.
+
+    A particle in a trap is shaken from frame to frame (Berg-Sørensen and Flyvbjerg 2004,
+    DOI 10.1063/1.1645654): no smooth curve shows that.
+    """
+    if not rest.size:
+        return 0.0
+    median, error = _CHI_SQUARE_MEDIAN
+    typical = float(np.median(rest**2)) / median
+    least = noise**2 * (1 + _SHAKEN * error / median / np.sqrt(rest.size))
+    return 1 - noise**2 / typical if typical > least else 0.0
 
 
 def _inside(mask: NDArray[np.bool_]) -> slice:

@@ -58,9 +58,11 @@ class LineTable:
         The reduced map of G frames on a polar grid, up to the band to be used.
     model_error:
         Error of the map besides its noise, as a share of the root mean square on each ring.
+    centring:
+        Error of the frames' centres along a line [length].
     """
 
-    def __init__(self, reduced: ReducedMap, model_error: float) -> None:
+    def __init__(self, reduced: ReducedMap, model_error: float, centring: float = 0.0) -> None:
         samples = reduced.samples
         groups, rings, lines = samples.shape
         turn = np.concatenate([samples, samples.conj()], axis=2)
@@ -80,7 +82,8 @@ class LineTable:
         self._cubics = np.stack([left, slope_left, square, cube], axis=2)
         power = np.mean(np.abs(samples) ** 2, axis=(0, 2))
         share = min(1.0, float(reduced.mu[1] - reduced.mu[0]) * reduced.radius / np.pi)
-        self._weights = np.tile(share / (reduced.noise**2 + model_error**2 * power), 2)
+        error = reduced.noise**2 + (model_error**2 + (reduced.mu * centring) ** 2) * power
+        self._weights = np.tile(share / error, 2)
         self.degrees = 2.0 * rings * share
         """Degrees of freedom of a pair of frames."""
         self.reach = float(reduced.mu[-1] * reduced.radius)

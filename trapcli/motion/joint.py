@@ -69,6 +69,7 @@ _FIRST_STEPS = 6  # of the first fit: a motion that is not found by then is none
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
+_CROWDED = 0.55  # share of the coefficients that the frames determine from which on there are too few
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have which is fitted in its place
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
@@ -191,7 +192,7 @@ def _best_motion(
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
-    fit, assessment = best
+    fit, assessment = best if knots else _uncrowded(*best, stack.low.time)
     if finest > band and fit.axes != (2,) and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
@@ -200,6 +201,23 @@ def _best_motion(
             fit, assessment = finer, told
     if not certified(fit, assessment):
         return _with_model_error(fit, assessment)
+    return fit, assessment
+
+
+def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Assessment]:
+    """Give the motion more knots while the frames determine most of its coefficients.
+
+    A particle that is shaken turns a little anew in every frame, however slowly it turns on the whole.
+    """
+    groups = fit.model.low.time
+    while assessment.parameters > _CROWDED * len(fit.axes) * fit.spline.size:
+        intervals = min(2 * fit.spline.intervals, len(groups) // 2, _MOST_KNOTS)
+        if intervals <= fit.spline.intervals:
+            break
+        spline = replace(fit.spline, intervals=intervals)
+        path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))
+        fit = fit.model.fit(path, groups, spline, axes=fit.axes)
+        assessment = fit.model.assess(fit)
     return fit, assessment
 
 
@@ -270,7 +288,9 @@ def _hypotheses(
     """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
     size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
     reduced, low = _grouped(stack, used, size)
-    evidence = Evidence(low.time, LineTable(reduced, _LINE_ERROR), MomentTable(low, _MOMENT_ERROR))
+    centring = float(np.median(stack.centers.errors[used])) / np.sqrt(size)
+    lines = LineTable(reduced, _LINE_ERROR, centring)
+    evidence = Evidence(low.time, lines, MomentTable(low, _MOMENT_ERROR))
     found: list[Hypothesis] = []
     yielded: list[Hypothesis] = []
     for attempt, (window, middle) in enumerate(_ATTEMPTS):

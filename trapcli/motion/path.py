@@ -108,12 +108,15 @@ class Path:
         """
         intervals = _FEWEST
         while intervals < spline.intervals:
-            fewer = replace(spline, intervals=intervals)
-            path = Path._at(fewer, fewer.fit(self.time, self.omega), self.time)
+            path = self.sampled(replace(spline, intervals=intervals), self.time)
             if align(path.R, self.R)[0].mean() <= tolerance:
                 return path
             intervals += 1 + intervals // 3
         return self
+
+    def sampled(self, spline: Spline, times: Array) -> Path:
+        """Return the path whose ω is the spline nearest to that of this one, at other `times` in any order."""
+        return Path._at(spline, spline.fit(self.time, self.omega), times)
 
     @classmethod
     def _at(cls, spline: Spline, coefficients: Array, times: Array) -> Path:
