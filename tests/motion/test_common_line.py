@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -96,6 +98,19 @@ def test_no_misfit_at_the_truth_and_much_away_from_it(
     wrong = random_rotations(FRAMES, 4)
     assert table.cost(R, *pairs).max() < 1e-4
     assert np.median(table.cost(wrong, *pairs)) > 5 * table.degrees
+
+
+def test_errors_of_the_centres_count_as_noise(blobs: Blobs, R: Array, pairs: Pairs, peak: float) -> None:
+    exact, shake = exact_map(blobs, R, 0.01 * peak), 0.1
+    shifts = shake * np.random.default_rng(6).standard_normal((FRAMES, 2))
+    along_lines = shifts @ np.array([np.cos(exact.phi), np.sin(exact.phi)])
+    shaken = dataclasses.replace(
+        exact, samples=exact.samples * np.exp(1j * exact.mu[:, None] * along_lines[:, None])
+    )
+    unaware, aware = (LineTable(shaken, 0.0, centring) for centring in (0.0, shake))
+    # both frames of a pair are shaken, but not seen to be on rings where noise prevails
+    assert 0.2 < aware.cost(R, *pairs).mean() / aware.degrees < 2.0
+    assert unaware.cost(R, *pairs).mean() > 4 * unaware.degrees
 
 
 def test_a_turn_of_the_object_and_the_mirror_change_nothing(
