@@ -14,10 +14,12 @@ from trapcli.simulation.motions import (
     PaperSpecial,
     SingleAxis,
     Still,
+    Thermal,
     Tumbling,
     integrate,
     true_motion,
 )
+from trapcli.simulation.render import simulate
 
 DURATION = 2.0
 TUMBLING = Tumbling.random(
@@ -39,9 +41,13 @@ ALL = {
     "third": THIRD,
 }
 T = np.linspace(0.0, DURATION, 201)
+# of frames that lie apart from those times: ω jumps at every frame
+KICKED = Thermal.random(
+    np.random.default_rng(4), TUMBLING, np.linspace(0.0, DURATION, 14), diffusion=0.2, shaking=0.3
+)
 
 
-@pytest.mark.parametrize("motion", ALL.values(), ids=ALL)
+@pytest.mark.parametrize("motion", [*ALL.values(), KICKED], ids=[*ALL, "kicked"])
 def test_rotations_solve_their_differential_equation(motion):
     h = 2e-4
     # R is 1 at the first time, so all five times of a stencil go into one call
@@ -195,3 +201,23 @@ def test_drift_is_smooth_and_of_the_given_size():
     ]
     assert 0.2 < np.median(sizes) < 2.0
     assert max(sizes) < 2.5
+
+
+def test_thermal_motion_is_a_random_walk_of_rotations_and_white_in_translation():
+    time = np.arange(4000) * 0.01
+    kicked = Thermal.random(np.random.default_rng(5), Still(), time, diffusion=0.02, shaking=0.3)
+    R = kicked.rotations(time)
+    np.testing.assert_array_equal(R[0], np.eye(3))
+    kicks = Rotation.from_matrix(R[:-1].transpose(0, 2, 1) @ R[1:]).as_rotvec()
+    np.testing.assert_allclose(kicks.std(axis=0), 0.02, rtol=0.04)
+    np.testing.assert_allclose(np.corrcoef(kicks[:-1].T, kicks[1:].T), np.eye(6), atol=0.06)
+    shifts = kicked.T(time)
+    np.testing.assert_allclose(shifts.std(axis=0), 0.3, rtol=0.04)
+    np.testing.assert_allclose(np.corrcoef(shifts[:-1].T, shifts[1:].T), np.eye(6), atol=0.06)
+
+
+def test_thermal_motion_leaves_the_rest_as_it_is():
+    quiet = simulate(seed=3, stack={"frames": 8}, motion={"kind": "tumbling"})[1]
+    kicked = simulate(seed=3, stack={"frames": 8}, motion={"kind": "tumbling", "shaking": 0.1})[1]
+    np.testing.assert_allclose(kicked.R, quiet.R, atol=1e-12)
+    assert np.abs(kicked.T - quiet.T).max() > 0.01

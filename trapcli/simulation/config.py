@@ -80,6 +80,10 @@ class MotionConfig:
     """Share by which the speed about that axis goes up and down, below 1."""
     drift: float = 0.1
     """Size of the smooth random translation, in radii of the object; ``paper`` has its own."""
+    diffusion: float = 0.0
+    """Thermal rotation from frame to frame: standard deviation about each axis [degrees]."""
+    shaking: float = 0.0
+    """Thermal translation, another one in every frame: standard deviation, in radii of the object."""
 
     def __post_init__(self) -> None:
         _one_of("motion.kind", self.kind, MOTIONS)
@@ -89,6 +93,8 @@ class MotionConfig:
         _check("motion.tilt", self.tilt, -90.0, 90.0)
         _check("motion.unevenness", self.unevenness, 0.0, 0.99)
         _check("motion.drift", self.drift, 0.0, 100.0)
+        _check("motion.diffusion", self.diffusion, 0.0, 180.0)
+        _check("motion.shaking", self.shaking, 0.0, 100.0)
 
 
 @dataclass(frozen=True)

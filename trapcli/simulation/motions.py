@@ -310,6 +310,77 @@ class DegenerateThird(RigidMotion):
         return self.single.omega(t) + fade[:, None] * self.general.omega(t)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Thermal(RigidMotion):
+    """A motion with Brownian motion on top: R = R₀ B, where B goes from one random rotation to the next.
+
+    Attributes
+    ----------
+    motion:
+        What R₀ and the translation are without it.
+    time:
+        ``(N,)`` evenly spaced times, between which B turns at a constant rate.
+    turn, shift:
+        ``(N, 3)`` rotation vectors by which B turns until the next time [rad], and translations [length].
+    """
+
+    motion: RigidMotion
+    time: Array
+    turn: Array
+    shift: Array
+
+    @classmethod
+    def random(
+        cls, rng: np.random.Generator, motion: RigidMotion, time: Array, *, diffusion: float, shaking: float
+    ) -> Thermal:
+        """Return a motion that is kicked at every time.
+
+        Parameters
+        ----------
+        diffusion:
+            Standard deviation of the rotation about each axis from one time to the next [rad].
+        shaking:
+            Standard deviation of the translation along each axis, another one at every time [length].
+        """
+        turn, shift = rng.standard_normal((2, len(time), 3))
+        return cls(motion=motion, time=time, turn=diffusion * turn, shift=shaking * shift)
+
+    def omega(self, t: Array) -> Array:
+        """Return ω₀, turned by B, plus the rate at which B turns from there on."""
+        before, _ = self._place(t)
+        return np.asarray(self._walk(t).inv().apply(self.motion.omega(t)) + self.turn[before] / self._step)
+
+    def T(self, t: Array) -> Array:
+        """Return the translation, linear from one time to the next."""
+        shift = np.stack([np.interp(t, self.time, component) for component in self.shift.T], axis=1)
+        return self.motion.T(t) + shift
+
+    def rotations(self, t: Array) -> Array:
+        """Return R, 1 at the first of ``(N,)`` ascending times."""
+        walk = self._walk(t).as_matrix()
+        R: Array = walk[0].T @ self.motion.rotations(t) @ walk
+        return R
+
+    @property
+    def _step(self) -> float:
+        return float(self.time[1] - self.time[0]) if len(self.time) > 1 else 1.0
+
+    def _walk(self, t: Array) -> Rotation:
+        """Return B."""
+        walked = [Rotation.identity()]
+        for turn in Rotation.from_rotvec(self.turn[:-1]):
+            walked.append(walked[-1] * turn)
+        before, since = self._place(t)
+        return Rotation.concatenate(walked)[before] * Rotation.from_rotvec(since[:, None] * self.turn[before])
+
+    def _place(self, t: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return the last of the times up to `t`, and how far `t` is on the way to the next."""
+        # a time that rounding has left just before its own step belongs to it
+        place = (t - self.time[0]) / self._step + 1e-9
+        before = np.clip(np.floor(place).astype(np.intp), 0, len(self.time) - 1)
+        return before, np.maximum(place - before - 1e-9, 0.0)
+
+
 def true_motion(
     motion: RigidMotion,
     center: Array,

@@ -23,6 +23,7 @@ from trapcli.simulation.motions import (
     RigidMotion,
     SingleAxis,
     Still,
+    Thermal,
     Tumbling,
     true_motion,
 )
@@ -37,7 +38,7 @@ PEAK_FRAMES = 64
 """Frames that tell the peak of the attenuation."""
 
 # one stream of random numbers for each part, so that a change of one leaves the others as they are
-_PHANTOM, _MOTION, _DRIFT, _SPECKS, _FRAME, _EMPTY_FRAME = range(6)
+_PHANTOM, _MOTION, _DRIFT, _SPECKS, _FRAME, _EMPTY_FRAME, _THERMAL = range(7)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +69,14 @@ class Scene:
             amplitude=config.motion.drift * phantom.radius,
             duration=duration,
         )
-        return cls(config, phantom, _motion(config.motion, duration, drift, _generator(config.seed, _MOTION)))
+        motion = _motion(config.motion, duration, drift, _generator(config.seed, _MOTION))
+        scene = cls(config, phantom, motion)
+        diffusion, shaking = np.deg2rad(config.motion.diffusion), config.motion.shaking * phantom.radius
+        if not (diffusion or shaking):
+            return scene
+        rng = _generator(config.seed, _THERMAL)
+        thermal = Thermal.random(rng, motion, scene.time, diffusion=diffusion, shaking=shaking)
+        return replace(scene, motion=thermal)
 
     @property
     def time(self) -> Array:
