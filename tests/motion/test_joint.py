@@ -274,6 +274,22 @@ def test_a_motion_that_the_first_window_misses() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("noise", "best"), [(0.01, 0.35), (0.05, 1.0)])
+def test_thermal_motion(noise: float, best: float) -> None:
+    """The particle turns anew in every frame: no few knots hold that, and no smooth ω."""
+    compared = []
+    for seed in (2, 3, 4):
+        kicks = {"diffusion": 0.5, "shaking": 0.03}
+        images, truth = render("tumbling", "blobs", seed=seed, frames=160, noise=noise, **kicks)
+        found = estimate(images, truth.time)
+        assert found.identifiable
+        compared.append(errors(found, truth).errors)
+    assert np.mean([one["R_aligned"].mean for one in compared]) < best
+    for name, least in (("T", 0.88), ("R", 0.88), ("phi", 0.5), ("omega_3", 0.45), ("alpha", 0.5)):
+        assert np.mean([one[name].within_2_sigma for one in compared]) > least, name
+
+
+@pytest.mark.slow
 def test_a_long_noisy_stack() -> None:
     """Three turns at 5 % noise: what a path has gone through keeps its ends from going astray."""
     images, truth = render("tumbling", "blobs", 5, frames=600, pixels=64, noise=0.05, total_angle=1080.0)

@@ -48,7 +48,7 @@ def test_a_shape_errs_less_about_the_axes_that_are_steady() -> None:
         free = Roughness(SPLINE)
         design, bend = free._design(still(), 0), free._bend(still(), 0)
         for roughness in (
-            free._alike(hessian, downhill, design, bend),
+            free._alike(hessian, downhill, design, bend)[0],
             free.weighed(hessian, downhill, still(), 0),
         ):
             step = np.linalg.solve(hessian + roughness.curvature(still(), 0), downhill)
@@ -70,12 +70,33 @@ def test_the_shape_turns_with_the_axes() -> None:
     )
 
 
-def test_the_penalty_has_its_gradient_and_curvature() -> None:
+def test_kicks_are_told_from_a_motion_that_is_smooth() -> None:
+    time = np.linspace(0, 1, 200)
+    values = SPLINE.values(time)
+    smooth_error: list[float] = []
+    kicked_error: list[float] = []
+    for seed in range(10):
+        kicks = ERROR * np.random.default_rng(100 + seed).normal(size=(200, 3))
+        angles = 0.1 * uneven(time) + np.cumsum(kicks, axis=0)
+        assert Roughness(SPLINE).kicked(*measured(0.1 * uneven(time), seed), still(), 0).kicks == 0
+        change = *measured(angles, seed), still(), 0
+        found = Roughness(SPLINE).kicked(*change)
+        assert found.kicks > 0
+        for roughness, errors in ((Roughness(SPLINE), smooth_error), (found, kicked_error)):
+            hessian = change[0] + roughness.weighed(*change).curvature(still(), 0)
+            step = np.linalg.solve(hessian, change[1]).reshape(-1, 3)
+            errors.append(np.mean((values @ step - angles) ** 2))
+    assert (np.array(kicked_error) < np.array(smooth_error)).all()
+    assert np.mean(kicked_error) < 0.95 * np.mean(smooth_error)
+
+
+@pytest.mark.parametrize("kicks", [0.0, 100.0])
+def test_the_penalty_has_its_gradient_and_curvature(kicks: float) -> None:
     rng = np.random.default_rng(2)
     grid = SPLINE.grid
     path = Path(grid, np.tile(np.eye(3), (len(grid), 1, 1)), rng.normal(size=(len(grid), 3)))
     root = rng.normal(size=(3, 3))
-    roughness = Roughness(SPLINE, weight=2.0, shape=root @ root.T)
+    roughness = Roughness(SPLINE, weight=2.0, shape=root @ root.T, kicks=kicks)
     bend, h = rng.normal(size=(SPLINE.size, 3)), 1e-6
     up, down = (roughness.penalty(path.bent(SPLINE, sign * h * bend), 0) for sign in (1, -1))
     assert (up - down) / (4 * h) == pytest.approx(roughness.uphill(path, 0) @ bend.ravel(), rel=1e-5)

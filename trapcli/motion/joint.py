@@ -205,20 +205,21 @@ def _best_motion(
 
 
 def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Assessment]:
-    """Give the motion more knots while the frames determine most of its coefficients.
+    """Give the motion more knots while the frames determine most of its coefficients, or it is kicked.
 
-    A particle that is shaken turns a little anew in every frame, however slowly it turns on the whole.
+    A particle in thermal motion turns a little anew in every frame, however slowly it turns on the whole.
     """
     groups = fit.model.low.time
-    while assessment.parameters > _CROWDED * len(fit.axes) * fit.spline.size:
-        intervals = min(2 * fit.spline.intervals, len(groups) // 2, _MOST_KNOTS)
-        if intervals <= fit.spline.intervals:
-            break
-        spline = replace(fit.spline, intervals=intervals)
+    while True:
+        crowded = assessment.parameters > _CROWDED * len(fit.axes) * fit.spline.size
+        kicked = fit.roughness is not None and fit.roughness.kicks > 0
+        most = min(len(groups) - 1, _MOST_KNOTS)
+        if not (crowded or kicked) or fit.spline.intervals >= most:
+            return fit, assessment
+        spline = replace(fit.spline, intervals=most if kicked else min(2 * fit.spline.intervals, most))
         path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))
         fit = fit.model.fit(path, groups, spline, axes=fit.axes)
         assessment = fit.model.assess(fit)
-    return fit, assessment
 
 
 def _repeats(one: Candidate, other: Candidate) -> bool:

@@ -55,6 +55,7 @@ _SPREAD = ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0))  # of the logarithms of both, at 
 _LOOKS = 20  # for the likeliest
 _LOOSE = 4.0  # edges are no samples of a prior, and must not be smoothed away where they are seen
 _PROBES = 2  # objects that are fitted to noise alone
+_NEAR = 1.5  # misfit per degree of freedom up to which it may tell kicks from a wrong motion
 _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
 _STEPS = 10
@@ -282,7 +283,7 @@ class ObjectModel:
         """
         groups = len(times)
         values = spline.values(times)
-        roughness = Roughness(spline, axes) if smooth else None
+        roughness: Roughness | None = None
         bent = _coefficients(spline, axes)
         now = self._tried(path, np.zeros((groups, 2)))
         normal: Normal | None = None
@@ -302,10 +303,14 @@ class ObjectModel:
             hessian = _pinned(eliminated.hessian, now.views.R, values)[np.ix_(bent, bent)]
             informed = _informed(hessian, by_noise[np.ix_(bent, bent)])
             hessian, downhill = informed @ hessian @ informed.T, informed @ downhill[bent]
-            if roughness is not None:
+            if smooth:
                 # far from the motion the misfit is large, and must not call for wiggles
                 excess = max(1.0, state.cost / self._degrees(groups))
-                roughness = roughness.weighed(hessian / excess, downhill / excess, now.path, groups)
+                change = hessian / excess, downhill / excess, now.path, groups
+                if roughness is None:
+                    roughness = Roughness(spline, axes)
+                    roughness = roughness.kicked(*change) if excess < _NEAR else roughness
+                roughness = roughness.weighed(*change)
                 roughness = replace(roughness, weight=excess * roughness.weight)
                 hessian += roughness.curvature(now.path, groups)
                 downhill -= roughness.uphill(now.path, groups)

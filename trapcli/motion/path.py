@@ -115,7 +115,7 @@ class Path:
         return self
 
     def sampled(self, spline: Spline, times: Array) -> Path:
-        """Return the path whose ω is the spline nearest to that of this one, at other `times` in any order."""
+        """Return the path of the spline nearest to ω at its own times, at other `times` in any order."""
         return Path._at(spline, spline.fit(self.time, self.omega), times)
 
     @classmethod

@@ -6,6 +6,10 @@ the one under which the data are likeliest, the motion integrated out in the qua
 misfit: one search finds its size, expectation and maximization its shape (Dempster, Laird and Rubin 1977,
 DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have smoothed away (Wahba 1983,
 DOI 10.1111/j.2517-6161.1983.tb01239.x).
+
+Thermal motion kicks a particle anew all the time: R goes on a random walk, and ω is white. Second differences
+of white noise are correlated as the squares of the second difference are; how much of that there is, is told
+by the evidence too.
 """
 
 from __future__ import annotations
@@ -25,6 +29,8 @@ Array = NDArray[np.float64]
 _RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
 _ROUNDS = 6  # of expectation and maximization, each time that the weight is told
 _ALIKE = 1.0  # second differences that are taken as seen beforehand, alike in all directions
+_KICKS = 1e1, 1e3, 1e5, 1e7  # that are tried, one after the other until the data get less likely
+_SURE = 6.0  # change of minus twice a log-likelihood that counts
 _FREE = 3  # for each axis: a constant rotation and an ω that is linear in time cost nothing
 
 
@@ -45,12 +51,15 @@ class Roughness:
     shape:
         ``(A, A)`` inverse of the covariance of second differences, with a determinant of 1; None for a
         covariance that is alike in all directions.
+    kicks:
+        Variance of what is white in ω, in units of that of second differences.
     """
 
     spline: Spline
     axes: tuple[int, ...] = (0, 1, 2)
     weight: float = 0.0
     shape: Array | None = None
+    kicks: float = 0.0
 
     def penalty(self, path: Path, after: int) -> float:
         """Return what the path's roughness counts."""
@@ -66,6 +75,24 @@ class Roughness:
         design = self._weighted(self._design(path, after))
         return np.asarray(self.weight * design.T @ design)
 
+    def kicked(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+        """Return the roughness with as many kicks as make the data likeliest; arguments as of `weighed`."""
+
+        def tried(kicks: float) -> tuple[Roughness, float]:
+            one = replace(self, kicks=kicks)
+            found, surprise = one._alike(hessian, downhill, one._design(path, after), one._bend(path, after))
+            free = len(self.axes) * self._rank(hessian) * np.log(found.weight)
+            return one, float(surprise + free - found._volume(path, after))
+
+        best, least = tried(0.0)
+        for kicks in _KICKS:
+            one, surprise = tried(kicks)
+            if surprise > least + _SURE:
+                break
+            if surprise < least - _SURE:
+                best, least = one, surprise
+        return best
+
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
         """Return the roughness with the weight and shape under which the data are likeliest.
 
@@ -76,13 +103,18 @@ class Roughness:
             minus twice a log-likelihood, by ``xᵀ hessian x − 2 downhill · x``.
         """
         design, bend = self._design(path, after), self._bend(path, after)
-        roughness = self._alike(hessian, downhill, design, bend)
+        roughness, _ = self._alike(hessian, downhill, design, bend)
         for _ in range(_ROUNDS if len(self.axes) > 1 else 0):
             roughness = roughness._likelier(hessian, downhill, design, bend)
         return roughness
 
-    def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
-        """Return the roughness that is alike in all directions, with the likeliest weight."""
+    def _alike(
+        self, hessian: Array, downhill: Array, design: Array, bend: Array
+    ) -> tuple[Roughness, float]:
+        """Return the roughness that is alike in all directions, with the likeliest weight.
+
+        With minus twice the logarithm of the evidence for that weight.
+        """
         alike = replace(self, shape=None)
         design, bend = alike._weighted(design), alike._weighted(bend)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
@@ -99,7 +131,7 @@ class Roughness:
             return float(weight * square - gained @ gained + volume - rank * np.log(weight))
 
         best: Any = minimize_scalar(surprise, bounds=_RANGE, method="bounded", options={"xatol": 0.05})
-        return replace(alike, weight=unit * 10.0 ** float(best.x))
+        return replace(alike, weight=unit * 10.0 ** float(best.x)), float(best.fun)
 
     def _likelier(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness with the covariance that second differences are expected to have."""
@@ -118,6 +150,13 @@ class Roughness:
         covariance /= self._rank(hessian) + _ALIKE
         size = float(np.linalg.det(covariance)) ** (1 / axes)
         return replace(self, weight=1 / size, shape=size * np.linalg.inv(covariance))
+
+    def _volume(self, path: Path, after: int) -> float:
+        """Return the logarithm of the determinant of the curvature; a turn of 1 rad counts 1 as well."""
+        curvature = self.curvature(path, after)
+        curvature[np.diag_indices_from(curvature)] += 1.0
+        factor = scipy.linalg.cholesky(curvature, lower=True, check_finite=False)
+        return 2 * float(np.log(np.diag(factor)).sum())
 
     def _rank(self, hessian: Array) -> float:
         """Return how many second differences of each component the P coefficients decide."""
@@ -148,8 +187,14 @@ class Roughness:
         return np.asarray(rough.reshape(*rough.shape[:2], -1))
 
     def _difference(self) -> Array:
+        """Return the matrix that takes second differences on the grid, and makes them independent."""
         grid = self.spline.grid
-        return np.asarray((grid[1] - grid[0]) * np.diff(np.eye(len(grid)), 2, axis=0))
+        second = np.diff(np.eye(len(grid)), 2, axis=0)
+        if self.kicks:
+            covariance = np.eye(len(second)) + self.kicks * second @ second.T
+            factor = scipy.linalg.cholesky(covariance, lower=True)
+            second = scipy.linalg.solve_triangular(factor, second, lower=True)
+        return np.asarray((grid[1] - grid[0]) * second)
 
     def _omega(self, path: Path, after: int) -> Array:
         last = len(path.time) - after
