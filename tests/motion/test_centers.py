@@ -179,9 +179,7 @@ def test_noise_whose_high_frequencies_a_codec_has_cut(cut: bool) -> None:
 
 
 @pytest.mark.parametrize(("jitter", "drift"), [(0.1, 3.0), (0.0, 3.0), (0.1, 0.0)])
-def test_a_particle_that_is_shaken_while_it_drifts(
-    jitter: float, drift: float, render, blobs
-) -> None:  # type: ignore[no-untyped-def]
+def test_a_particle_that_is_shaken_while_it_drifts(jitter: float, drift: float, render, blobs) -> None:  # type: ignore[no-untyped-def]
     pixel, frames = 0.25, 150
     rng = np.random.default_rng(1)
     slow = drift * np.sin(np.linspace(0, 5, frames))[:, None] * [1.0, -0.5]

@@ -108,9 +108,7 @@ class Roughness:
             roughness = roughness._likelier(hessian, downhill, design, bend)
         return roughness
 
-    def _alike(
-        self, hessian: Array, downhill: Array, design: Array, bend: Array
-    ) -> tuple[Roughness, float]:
+    def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> tuple[Roughness, float]:
         """Return the roughness that is alike in all directions, with the likeliest weight.
 
         With minus twice the logarithm of the evidence for that weight.
