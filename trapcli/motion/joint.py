@@ -70,6 +70,7 @@ _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that com
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
 _FEWEST_KNOTS = 4, 12  # intervals of these splines at least
 _CROWDED = 0.55  # share of the coefficients that the frames determine from which on there are too few
+_HOPELESS = 6.0  # misfit per degree of freedom that no knots mend
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have which is fitted in its place
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
@@ -213,8 +214,9 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
     while True:
         crowded = assessment.parameters > _CROWDED * len(fit.axes) * fit.spline.size
         kicked = fit.roughness is not None and fit.roughness.kicks > 0
-        most = min(len(groups) - 1, _MOST_KNOTS)
-        if not (crowded or kicked) or fit.spline.intervals >= most:
+        most = min(len(groups) - 3, _MOST_KNOTS)  # as many coefficients as groups
+        hopeless = fit.cost > _HOPELESS * assessment.degrees
+        if hopeless or not (crowded or kicked) or fit.spline.intervals >= most:
             return fit, assessment
         spline = replace(fit.spline, intervals=most if kicked else min(2 * fit.spline.intervals, most))
         path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))

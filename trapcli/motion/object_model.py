@@ -52,12 +52,14 @@ _WIDTH = 0.4  # standard deviation of a blob in units of `spacing`, where it is 
 _PRIOR_BAND = 12.0  # band times radius up to which the prior is told
 _TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
 _SPREAD = ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0))  # of the logarithms of both, at first
+_BELIEVABLE = ((-7.0, 0.0), (-14.0, 2.3))  # ranges of them: what no prior explains wants no end of power
 _LOOKS = 20  # for the likeliest
 _LOOSE = 4.0  # edges are no samples of a prior, and must not be smoothed away where they are seen
 _PROBES = 2  # objects that are fitted to noise alone
 _NEAR = 1.5  # misfit per degree of freedom up to which it may tell kicks from a wrong motion
 _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
 _FIXED_GAUGE = 10.0  # stiffness of the free orientation, in units of the mean curvature
+_ROUNDING = 1e-9  # stiffness of what nothing tells, in the same units
 _STEPS = 10
 _CONVERGED = 0.1  # gain in misfit, in units of a noise's, that ends the search
 _FAITHFUL = 1e-10  # accuracy of the modes of an object: far below noise of 0.1 % of the peak
@@ -242,6 +244,7 @@ class ObjectModel:
             surprise,
             start,
             method="Nelder-Mead",
+            bounds=_BELIEVABLE,
             options={"initial_simplex": start + _SPREAD, "xatol": 0.1, "fatol": 1.0, "maxfev": _LOOKS},
         )
         found = prior(best.x)
@@ -840,4 +843,6 @@ def _pinned(hessian: Array, R: Array, values: Array) -> Array:
     )
     free, _ = np.linalg.qr(free)
     scale = float(np.mean(np.diag(hessian)))
-    return np.asarray(hessian + _FIXED_GAUGE * scale * free @ free.T + 1e-12 * scale * np.eye(len(hessian)))
+    # differences of large matrices are rounded, and of a motion that is all wrong not positive
+    rounded = _ROUNDING * scale * np.eye(len(hessian))
+    return np.asarray(hessian + _FIXED_GAUGE * scale * free @ free.T + rounded)

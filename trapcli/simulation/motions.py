@@ -352,7 +352,7 @@ class Thermal(RigidMotion):
 
     def T(self, t: Array) -> Array:
         """Return the translation, linear from one time to the next."""
-        shift = np.stack([np.interp(t, self.time, component) for component in self.shift.T], axis=1)
+        shift: Array = np.stack([np.interp(t, self.time, component) for component in self.shift.T], axis=1)
         return self.motion.T(t) + shift
 
     def rotations(self, t: Array) -> Array:
