@@ -6,6 +6,7 @@ import dataclasses
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -210,6 +211,12 @@ def test_frames_over_which_a_residual_is_alike(share: float) -> None:
         after *= np.sqrt(1 - share**2)
         after += share * before
     assert joint._alike(residual) == pytest.approx((1 + share) / (1 - share), rel=0.1)
+
+
+@pytest.mark.parametrize(("misfit", "taken"), [(0.98, True), (1.005, True), (1.03, False)])
+def test_the_finest_fit_must_explain_the_images_as_well(misfit: float, taken: bool) -> None:
+    coarse, fine = (SimpleNamespace(cost=c * 20000.0, degrees=20000.0) for c in (1.0, misfit))
+    assert joint._as_well(fine, fine, coarse, coarse) == taken  # type: ignore[arg-type]
 
 
 def test_too_few_frames() -> None:

@@ -76,6 +76,7 @@ _NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have whic
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _PATIENCE = 5.0  # of a look with a coarse model at such a rotation, in units of what noise gives
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
+_WORSE = 2.5  # standard deviations by which the misfit of the finest fit may be above that of the one before
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
 
@@ -197,8 +198,9 @@ def _best_motion(
     if finest > band and fit.axes != (2,) and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
+        told = model.assess(finer)
         # a prior told at low frequencies may be wrong so far beyond
-        if certified(finer, told := model.assess(finer)):
+        if certified(finer, told) and _as_well(finer, told, fit, assessment):
             fit, assessment = finer, told
     if not certified(fit, assessment):
         return _with_model_error(fit, assessment)
@@ -222,6 +224,12 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
         path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))
         fit = fit.model.fit(path, groups, spline, axes=fit.axes)
         assessment = fit.model.assess(fit)
+
+
+def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:
+    """Tell whether the misfit per degree of freedom of a finer fit is that of another, but for noise."""
+    worse = finer.cost / told.degrees - fit.cost / assessment.degrees
+    return bool(worse <= _WORSE * np.sqrt(2 / told.degrees))
 
 
 def _repeats(one: Candidate, other: Candidate) -> bool:
