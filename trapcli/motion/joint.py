@@ -194,8 +194,11 @@ def _best_motion(
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
-    fit, assessment = best if knots else _uncrowded(*best, stack.low.time)
-    if finest > band and fit.axes != (2,) and certified(fit, assessment):
+    fit, assessment = best
+    turns_in_plane = fit.axes == (2,)  # what there is besides, a richer motion has told
+    if not (knots or turns_in_plane):
+        fit, assessment = _uncrowded(fit, assessment, stack.low.time)
+    if finest > band and not turns_in_plane and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
         told = model.assess(finer)
@@ -214,7 +217,7 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
     """
     groups = fit.model.low.time
     while True:
-        crowded = assessment.parameters > _CROWDED * len(fit.axes) * fit.spline.size
+        crowded = assessment.parameters > _CROWDED * 3 * fit.spline.size
         kicked = fit.roughness is not None and fit.roughness.kicks > 0
         most = min(len(groups) - 3, _MOST_KNOTS)  # as many coefficients as groups
         hopeless = fit.cost > _HOPELESS * assessment.degrees
@@ -222,7 +225,7 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
             return fit, assessment
         spline = replace(fit.spline, intervals=most if kicked else min(2 * fit.spline.intervals, most))
         path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))
-        fit = fit.model.fit(path, groups, spline, axes=fit.axes)
+        fit = fit.model.fit(path, groups, spline)
         assessment = fit.model.assess(fit)
 
 
