@@ -292,7 +292,7 @@ def test_thermal_motion(noise: float, best: float) -> None:
         assert found.identifiable
         compared.append(errors(found, truth).errors)
     assert np.mean([one["R_aligned"].mean for one in compared]) < best
-    for name, least in (("T", 0.88), ("R", 0.88), ("phi", 0.5), ("omega_3", 0.45), ("alpha", 0.5)):
+    for name, least in (("T", 0.88), ("R", 0.8), ("phi", 0.5), ("omega_3", 0.45), ("alpha", 0.5)):
         assert np.mean([one[name].within_2_sigma for one in compared]) > least, name
 
 
