@@ -186,7 +186,7 @@ def test_a_particle_that_is_shaken_while_it_drifts(jitter: float, drift: float, 
     place = pixel * (slow + jitter * rng.standard_normal((frames, 2)))
     x = (np.arange(64) - 32) * pixel
     centre = blobs.center[:2]
-    clean = np.array([blobs.project(np.eye(3), blobs.center * 0 - [*p, 0], x, x) for p in place])
+    clean = np.array([blobs.project(np.eye(3), -np.array([*p, 0.0]), x, x) for p in place])
     noise = 0.05
     found = centers_of(clean + noise * clean.max() * rng.standard_normal(clean.shape), pixel)
     pull = (found.center - centre - place) / found.errors

@@ -311,8 +311,8 @@ class ObjectModel:
                 excess = max(1.0, state.cost / self._degrees(groups))
                 change = hessian / excess, downhill / excess, now.path, groups
                 if roughness is None:
-                    roughness = Roughness(spline, axes)
-                    roughness = roughness.kicked(*change) if excess < _NEAR else roughness
+                    first = Roughness(spline, axes)
+                    roughness = first.kicked(*change) if excess < _NEAR else first
                 roughness = roughness.weighed(*change)
                 roughness = replace(roughness, weight=excess * roughness.weight)
                 hessian += roughness.curvature(now.path, groups)

@@ -15,6 +15,7 @@ by the evidence too.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -80,9 +81,10 @@ class Roughness:
 
         def tried(kicks: float) -> tuple[Roughness, float]:
             one = replace(self, kicks=kicks)
-            found, surprise = one._alike(hessian, downhill, one._design(path, after), one._bend(path, after))
+            design = one._design(path, after)
+            found, surprise = one._alike(hessian, downhill, design, one._bend(path, after))
             free = len(self.axes) * self._rank(hessian) * np.log(found.weight)
-            return one, float(surprise + free - found._volume(path, after))
+            return one, float(surprise + free - found._volume(design))
 
         best, least = tried(0.0)
         for kicks in _KICKS:
@@ -149,9 +151,10 @@ class Roughness:
         size = float(np.linalg.det(covariance)) ** (1 / axes)
         return replace(self, weight=1 / size, shape=size * np.linalg.inv(covariance))
 
-    def _volume(self, path: Path, after: int) -> float:
+    def _volume(self, design: Array) -> float:
         """Return the logarithm of the determinant of the curvature; a turn of 1 rad counts 1 as well."""
-        curvature = self.curvature(path, after)
+        design = self._weighted(design)
+        curvature = np.asarray(self.weight * design.T @ design)
         curvature[np.diag_indices_from(curvature)] += 1.0
         factor = scipy.linalg.cholesky(curvature, lower=True, check_finite=False)
         return 2 * float(np.log(np.diag(factor)).sum())
@@ -173,7 +176,7 @@ class Roughness:
 
     def _bend(self, path: Path, after: int) -> Array:
         """Return the ``(T, A)`` second differences of ω along the axes."""
-        return np.asarray(self._difference() @ self._omega(path, after)[:, list(self.axes)])
+        return np.asarray(self._difference @ self._omega(path, after)[:, list(self.axes)])
 
     def _design(self, path: Path, after: int) -> Array:
         """Return ``(T, A, P)`` derivatives of the second differences by the spline's coefficients."""
@@ -181,9 +184,10 @@ class Roughness:
         change = np.einsum("mb,ij->mibj", self.spline.slopes(grid), np.eye(3))
         # δω = δ' + ω × δ
         change += np.einsum("mij,mb->mibj", cross_matrix(omega), self.spline.values(grid))
-        rough = np.tensordot(self._difference(), change[:, axes][..., axes], (1, 0))
+        rough = np.tensordot(self._difference, change[:, axes][..., axes], (1, 0))
         return np.asarray(rough.reshape(*rough.shape[:2], -1))
 
+    @cached_property
     def _difference(self) -> Array:
         """Return the matrix that takes second differences on the grid, and makes them independent."""
         grid = self.spline.grid

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
@@ -365,13 +368,16 @@ class Thermal(RigidMotion):
     def _step(self) -> float:
         return float(self.time[1] - self.time[0]) if len(self.time) > 1 else 1.0
 
+    @cached_property
+    def _walked(self) -> Rotation:
+        """B at the times."""
+        walked = accumulate(Rotation.from_rotvec(self.turn[:-1]), mul, initial=Rotation.identity())
+        return Rotation.concatenate(list(walked))
+
     def _walk(self, t: Array) -> Rotation:
         """Return B."""
-        walked = [Rotation.identity()]
-        for turn in Rotation.from_rotvec(self.turn[:-1]):
-            walked.append(walked[-1] * turn)
         before, since = self._place(t)
-        return Rotation.concatenate(walked)[before] * Rotation.from_rotvec(since[:, None] * self.turn[before])
+        return self._walked[before] * Rotation.from_rotvec(since[:, None] * self.turn[before])
 
     def _place(self, t: Array) -> tuple[NDArray[np.intp], Array]:
         """Return the last of the times up to `t`, and how far `t` is on the way to the next."""
