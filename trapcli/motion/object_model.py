@@ -1,6 +1,6 @@
 """A low-frequency model of the object, eliminated exactly: the likelihood of a motion.
 
-The object is a sum of Gaussian blobs on a body-centred cubic lattice, the sparsest that holds a ball of
+The object is a sum of blobs on a body-centred cubic lattice, the sparsest that holds a ball of
 frequencies (Petersen and Middleton 1962, DOI 10.1016/S0019-9958(62)90633-2); their amplitudes enter the
 frames' low-frequency modes linearly and are solved for at every motion (variable projection; Golub and
 Pereyra 2003, DOI 10.1088/0266-5611/19/2/201). What remains is the misfit of the motion alone. Each frame's
@@ -48,12 +48,13 @@ GUARDS = (3.0, 4.5, 6.0)
 """Guards of the lattice that are tried, see `ObjectModel`."""
 
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
-_WIDTH = 0.4  # standard deviation of a blob in units of `spacing`, where it is not known
-_PRIOR_BAND = 12.0  # band times radius up to which the prior is told
+_WIDTH = 0.4  # width of a blob in units of `spacing`, where it is not known
 _TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
-_SPREAD = ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0))  # of the logarithms of both, at first
 _BELIEVABLE = ((-7.0, 0.0), (-14.0, 2.3))  # ranges of them: what no prior explains wants no end of power
-_LOOKS = 20  # for the likeliest
+_SEARCH = (
+    (12.0, ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0)), 20),
+    (np.inf, ((0.0, 0.0), (0.2, 0.0), (0.0, -0.5)), 10),
+)  # for the likeliest, roughly at first: band times radius up to which it explains, simplex, looks
 _LOOSE = 4.0  # edges are no samples of a prior, and must not be smoothed away where they are seen
 _PROBES = 2  # objects that are fitted to noise alone
 _NEAR = 1.5  # misfit per degree of freedom up to which it may tell kicks from a wrong motion
@@ -214,40 +215,47 @@ class ObjectModel:
     def likeliest(cls, low: LowBand, band: float, R: Array) -> ObjectModel:
         """Return the model that explains ``(G, 3, 3)`` rotations best, in as few amplitudes as it takes.
 
-        The guard is told by Akaike's criterion (1974, DOI 10.1109/TAC.1974.1100705): a smooth object needs a
-        coarser lattice than one with sharp edges. The prior is told by its evidence.
+        The prior is told by its evidence on the finest lattice; the guard then by Akaike's criterion (1974,
+        DOI 10.1109/TAC.1974.1100705): a smooth object needs a coarser lattice than one with sharp edges.
         """
+        prior = cls._likeliest_prior(low, band, GUARDS[-1], R)
 
         def surprise(model: ObjectModel) -> float:
             views = model.views(R)
             return model._cost(views, model.low.modes) + 2 * views.seen
 
-        models = [cls(low, band, guard=guard) for guard in GUARDS]
-        guard = models[int(np.argmin(in_parallel(surprise, models)))].guard
-        return cls(low, band, guard=guard, prior=cls._likeliest_prior(low, band, guard, R))
+        models = [cls(low, band, guard=guard, prior=prior) for guard in GUARDS]
+        return models[int(np.argmin(in_parallel(surprise, models)))]
 
     @classmethod
     def _likeliest_prior(cls, low: LowBand, band: float, guard: float, R: Array) -> Prior:
-        about, band = Prior.of(low), min(band, _PRIOR_BAND / low.radius)
+        about = Prior.of(low)
 
         def prior(logarithms: Array) -> Prior:
             width, power = np.exp(logarithms)
             return replace(about, width=width * low.radius, power=power * about.power)
 
-        def surprise(logarithms: Array) -> float:
+        def surprise(logarithms: Array, band: float) -> float:
             model = cls(low, band, guard=guard, prior=prior(logarithms))
             views = model.views(R)
             return model._cost(views, model.low.modes) + views.volume
 
-        start = np.log(_TYPICAL)
-        best = minimize(
-            surprise,
-            start,
-            method="Nelder-Mead",
-            bounds=_BELIEVABLE,
-            options={"initial_simplex": start + _SPREAD, "xatol": 0.1, "fatol": 1.0, "maxfev": _LOOKS},
-        )
-        found = prior(best.x)
+        best = np.log(_TYPICAL)
+        for highest, spread, looks in _SEARCH:
+            best = minimize(
+                surprise,
+                best,
+                args=(min(band, highest / low.radius),),
+                method="Nelder-Mead",
+                bounds=_BELIEVABLE,
+                options={
+                    "initial_simplex": best + np.array(spread),
+                    "xatol": 0.1,
+                    "fatol": 1.0,
+                    "maxfev": looks,
+                },
+            ).x
+        found = prior(best)
         return replace(found, power=_LOOSE * found.power)
 
     @property

@@ -1,9 +1,13 @@
 """What an object may be like before it is known: a random field that the frames' mean power describes.
 
-It is taken for a sum of Gaussian blobs of one size with random amplitudes, which follow how much of it lies
-at a distance from its centre. That is told by the mean of all frames, whatever the motion; how large and how
-strong the blobs are is told by the evidence (MacKay 1992, DOI 10.1162/neco.1992.4.3.415). Amplitudes that the
-frames do not determine then stay near 0 and add no noise to the motion.
+It is taken for a sum of blobs of one size with random amplitudes, which follow how much of it lies at a
+distance from its centre. That is told by the mean of all frames, whatever the motion; how large and how strong
+the blobs are is told by the evidence (MacKay 1992, DOI 10.1162/neco.1992.4.3.415). Amplitudes that the frames do
+not determine then stay near 0 and add no noise to the motion.
+
+What lies inside edges has a power that falls as k⁻⁴, that of a random medium of two densities as
+(1 + w²k²)⁻² (Debye, Anderson and Brumberger 1957, DOI 10.1063/1.1722830). Blobs have this power: where it is
+taken to fall faster, sharp objects seem to turn less than they do.
 """
 
 from __future__ import annotations
@@ -24,14 +28,14 @@ _LEAST = 0.01  # of the largest radial density: what may lie where none is seen
 
 @dataclass(frozen=True)
 class Prior:
-    """Gaussian amplitudes of blobs.
+    """Amplitudes of blobs, of a Gaussian distribution.
 
     Attributes
     ----------
     distance, density:
         ``(M,)`` distances from the centre [length] and the variance of amplitudes there, up to a factor.
     width:
-        Standard deviation of a blob [length].
+        Length w on which a blob falls off, as exp(−r / w) / r [length].
     power:
         Variance of a mode of the object at k = 0.
     """
@@ -58,7 +62,7 @@ class Prior:
         Of blobs of a `width` [length]; with the ``(K,)`` variances of the modes' noise.
         """
         seen = np.mean(np.abs(low.modes) ** 2, axis=0)
-        power = np.maximum(seen - noise, 0.01 * noise) * np.exp(np.sum((width * low.k) ** 2, axis=1))
+        power = np.maximum(seen - noise, 0.01 * noise) * (1 + np.sum((width * low.k) ** 2, axis=1)) ** 2
         return cls(np.zeros(1), np.ones(1), width, float(power.max()))
 
     def variance(self, position: Array) -> Array:
@@ -68,7 +72,7 @@ class Prior:
 
     def spectrum(self, k: Array) -> Array:
         """Return standard deviations of modes at spatial frequencies of length `k` [rad / length]."""
-        return np.asarray(np.sqrt(self.power) * np.exp(-0.5 * (self.width * k) ** 2))
+        return np.asarray(np.sqrt(self.power) / (1 + (self.width * k) ** 2))
 
 
 def radial_density(low: LowBand, distance: Array) -> Array:
