@@ -24,9 +24,11 @@ from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Spline, align
+from trapcli.motion.relief import relieved, score
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
     COARSE,
+    NOISE_ERROR,
     Stack,
     certified,
     judge,
@@ -141,7 +143,10 @@ def estimate_joint(
             "or turns about an axis of symmetry; no rotation can be told",
         )
     bands = (config.band, config.band) if config.band else _bands(low.select(used))
-    fit, assessment = _best_motion(stack, used, pace, bands, config.knots, progress)
+    fit, assessment = _best_motion(stack, used, pace, bands[0], config.knots, progress)
+    stack, fit, assessment = _quieter(stack, used, pace, fit, assessment)
+    low = _fine_groups(stack, used, pace)
+    fit, assessment = _refined(low, fit, assessment, time, bands[1], config.knots)
     verdict = judge(fit, assessment)
     unseen = unseen_turn(fit, assessment, bands[0]) if verdict.identifiable else None
     return to_motion(stack, fit, assessment, verdict, unseen)
@@ -169,15 +174,12 @@ def _best_motion(
     stack: Stack,
     used: NDArray[np.intp],
     pace: float,
-    bands: tuple[float, float],
+    band: float,
     knots: int,
     progress: Progress | None,
 ) -> tuple[Fit, Assessment]:
     """Return the motion that explains the frames best, of all hypotheses that are worth a look."""
-    band, finest = bands
-    fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
-    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
-    _, low = _grouped(stack, used, size)
+    low = _fine_groups(stack, used, pace)
     coarse: list[Fit] = []
     tried: list[Fit] = []
     best: tuple[Fit, Assessment] | None = None
@@ -190,15 +192,42 @@ def _best_motion(
         tried += new
         for rival in new:
             fitted = _fine_fit(rival, ObjectModel.likeliest(low, band, rival.R), smooth=not knots)
-            best = min(best or fitted, fitted, key=lambda one: one[0].cost - one[1].degrees)
+            best = min(best or fitted, fitted, key=lambda one: score(*one))
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
-    fit, assessment = best
+    return best
+
+
+def _quieter(
+    stack: Stack, used: NDArray[np.intp], pace: float, fit: Fit, assessment: Assessment
+) -> tuple[Stack, Fit, Assessment]:
+    """Lower the noise to what the motion leaves over: sharp edges that move pass for noise.
+
+    Too much of it would hide a wrong motion's misfit, and makes motions look better that see less.
+    """
+    share = fit.cost / assessment.degrees
+    if share >= 1 - NOISE_ERROR:
+        return stack, fit, assessment
+    stack = replace(stack, low=replace(stack.low, variance=share * stack.low.variance))
+    low = _fine_groups(stack, used, pace)
+    model = ObjectModel.likeliest(low, fit.model.band, fit.R)
+    smooth = fit.roughness is not None
+    fit = model.fit(fit.path, low.time, fit.spline, smooth=smooth, axes=fit.axes)
+    return stack, fit, model.assess(fit)
+
+
+def _refined(
+    low: LowBand, fit: Fit, assessment: Assessment, time: Array, finest: float, knots: int
+) -> tuple[Fit, Assessment]:
+    """Look for a likelier tilt, give the motion as many knots as it needs, and the object its sharp edges."""
     turns_in_plane = fit.axes == (2,)  # what there is besides, a richer motion has told
-    if not (knots or turns_in_plane):
-        fit, assessment = _uncrowded(fit, assessment, stack.low.time)
-    if finest > band and not turns_in_plane and certified(fit, assessment):
+    hopeless = fit.cost > _HOPELESS * assessment.degrees
+    if not (turns_in_plane or hopeless):
+        fit, assessment = relieved(low, fit, assessment)
+        if not knots:
+            fit, assessment = _uncrowded(fit, assessment, time)
+    if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
         told = model.assess(finer)
@@ -220,13 +249,15 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
         crowded = assessment.parameters > _CROWDED * 3 * fit.spline.size
         kicked = fit.roughness is not None and fit.roughness.kicks > 0
         most = min(len(groups) - 3, _MOST_KNOTS)  # as many coefficients as groups
-        hopeless = fit.cost > _HOPELESS * assessment.degrees
-        if hopeless or not (crowded or kicked) or fit.spline.intervals >= most:
+        if not (crowded or kicked) or fit.spline.intervals >= most:
             return fit, assessment
         spline = replace(fit.spline, intervals=most if kicked else min(2 * fit.spline.intervals, most))
         path = fit.path.sampled(spline, np.concatenate([time, spline.grid, groups]))
-        fit = fit.model.fit(path, groups, spline)
-        assessment = fit.model.assess(fit)
+        richer = fit.model.fit(path, groups, spline)
+        told = fit.model.assess(richer)
+        if score(richer, told) > score(fit, assessment):
+            return fit, assessment
+        fit, assessment = richer, told
 
 
 def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:
@@ -294,6 +325,13 @@ def _grouped(stack: Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMa
     mean = group_means(stack.reduced.samples[used], len(low.time))
     noise = stack.reduced.noise * np.sqrt(len(low.time) / len(used))
     return replace(stack.reduced, samples=mean, time=low.time, noise=noise), low
+
+
+def _fine_groups(stack: Stack, used: NDArray[np.intp], pace: float) -> LowBand:
+    """Return means over groups of frames within which the object turns too little to see it in the noise."""
+    fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
+    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
+    return _grouped(stack, used, size)[1]
 
 
 def _hypotheses(

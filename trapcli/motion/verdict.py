@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 _CERTIFIED = 1.06  # misfit per degree of freedom that pixel noise explains, where there are many
-_NOISE_ERROR = 0.03  # how well the noise is known
+NOISE_ERROR = 0.03
+"""How well the noise is known, as a share of its power."""
+
 _SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 _STRONG = 12.0  # band times radius of the modes that misfits of frames are relative to
@@ -70,7 +72,7 @@ class Verdict:
 def certified(fit: Fit, assessment: Assessment) -> bool:
     """Tell whether noise alone explains the misfit."""
     scatter = _SCATTER * np.sqrt(2 / assessment.degrees)
-    return bool(fit.cost <= max(_CERTIFIED, 1 + _NOISE_ERROR + scatter) * assessment.degrees)
+    return bool(fit.cost <= max(_CERTIFIED, 1 + NOISE_ERROR + scatter) * assessment.degrees)
 
 
 def judge(fit: Fit, assessment: Assessment) -> Verdict:

@@ -1,0 +1,84 @@
+"""How far the object turns out of the image plane, where it turns little: the bas-relief ambiguity.
+
+Views from nearly the same side look almost alike for a deeper object that turns less (Belhumeur, Kriegman and
+Yuille 1999, DOI 10.1023/A:1008154927611). The misfit then has several shallow minima along that way, and what
+an object may be like differs between them; a search downhill stays in the one that it comes upon first. So
+the motion is tilted more and less, and fitted again each time with the object's model that suits it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from trapcli.motion.low_band import LowBand
+from trapcli.motion.object_model import Assessment, Fit, ObjectModel
+from trapcli.motion.path import Path, Spline
+
+Array = NDArray[np.float64]
+
+_FACTORS = 2.0, 0.5
+_WIDE = np.deg2rad(30.0)  # tilt beyond which views differ enough to tell it
+_MOST = 6  # times that a better tilt is followed
+_BETTER = 1.0  # gain that counts, in units of the misfit
+
+
+def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
+    """Return the best fit among those with other tilts of the viewing direction, if they are all small."""
+    for _ in range(_MOST):
+        for factor in _FACTORS:
+            if factor * tilt(fit.path.R) > _FACTORS[0] * _WIDE:
+                continue
+            other = _refitted(low, fit, tilted(fit.path, factor, fit.spline))
+            if score(*other) < score(fit, assessment) - _BETTER:
+                fit, assessment = other
+                break
+        else:
+            break
+    return fit, assessment
+
+
+def score(fit: Fit, assessment: Assessment) -> float:
+    """Return the misfit less what is expected: of two motions the lower one is likelier."""
+    return fit.cost - assessment.degrees
+
+
+def tilt(R: Array) -> float:
+    """Return the root mean square angle of ``(N, 3, 3)`` viewing directions R e₃ to their mean [rad]."""
+    swing, _, _ = _swings(R)
+    return float(np.sqrt(np.mean(np.sum(swing**2, axis=1))))
+
+
+def tilted(path: Path, factor: float, spline: Spline) -> Path:
+    """Return the path whose viewing directions are `factor` times as far from their mean, spin unchanged.
+
+    Its ω is the nearest spline.
+    """
+    time, first = np.unique(path.time, return_index=True)
+    swing, spin, mean = _swings(path.R[first])
+    R = mean @ Rotation.from_rotvec(factor * swing).as_matrix() @ spin
+    return Path(time, R, path.omega[first]).near(spline, path.time)
+
+
+def _refitted(low: LowBand, fit: Fit, path: Path) -> tuple[Fit, Assessment]:
+    groups = low.time
+    model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(groups) :])
+    other = model.fit(path, groups, fit.spline, smooth=fit.roughness is not None)
+    return other, model.assess(other)
+
+
+def _swings(R: Array) -> tuple[Array, Array, Array]:
+    """Return ``(N, 3)`` rotation vectors across e₃, ``(N, 3, 3)`` spins about e₃ and the mean orientation.
+
+    R is the mean times the swing times the spin.
+    """
+    direction = R[:, :, 2].mean(axis=0)
+    e3 = np.array([0.0, 0.0, 1.0])
+    mean = Rotation.align_vectors(direction / np.linalg.norm(direction), e3)[0].as_matrix()
+    about = mean.T @ R
+    x, y, z = about[:, :, 2].T
+    across = np.hypot(x, y)
+    angle = np.arctan2(across, z) / np.maximum(across, 1e-300)
+    swing = np.stack([-y * angle, x * angle, np.zeros_like(x)], axis=1)
+    return swing, Rotation.from_rotvec(-swing).as_matrix() @ about, mean
