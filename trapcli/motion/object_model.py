@@ -9,8 +9,9 @@ transforms on the lattice. The real part of a mode sees only the part of the obj
 centre, the imaginary part the odd one, so that the normal matrix falls into two blocks of half the size.
 
 The object follows the noise as well: on the average the misfit lacks as much as the number of amplitudes that
-the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. Both together are
-minimized; their mean over the noise does not favour motions that see more.
+the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. What an amplitude has
+beside the noise costs 1 / L in a prior of L times the right variance. So the misfit and 1 − 1 / L times that
+number are minimized together; their mean over noise and objects does not favour motions that see more, or less.
 
 What the object holds of the noise turns with the motion as well. On the average it adds the same matrix T to
 the normal matrix J of the motion and to the covariance of the gradient, as the noise in the object and the
@@ -195,6 +196,8 @@ class ObjectModel:
         expected = prior or Prior.vague(self.low, _WIDTH * spacing, self.variance)
         self._blob = expected.spectrum(radial) / np.sqrt(len(self._index))
         precision = 1 / expected.variance(self.position)
+        # mean lack of the misfit for each amplitude that is seen: an amplitude has its share of the prior
+        self._lacking = 1 - 1 / expected.looseness
         # of opposite points alike
         self._precision = precision[: len(self._half_index)], precision[: len(self._half_index) - 1]
         self._gain = self._root * self._blob
@@ -256,7 +259,7 @@ class ObjectModel:
                 },
             ).x
         found = prior(best)
-        return replace(found, power=_LOOSE * found.power)
+        return replace(found, power=_LOOSE * found.power, looseness=_LOOSE)
 
     @property
     def data_count(self) -> float:
@@ -556,7 +559,7 @@ class ObjectModel:
         The shifts are those that lessen the misfit most while the motion stays; by how much comes last.
         """
         gradient = np.einsum("gki,gk->gi", state.slopes.conj(), state.residual).real
-        turning, shifting = gradient[:, :3] - 0.5 * seen_slopes, gradient[:, 3:]
+        turning, shifting = gradient[:, :3] - 0.5 * self._lacking * seen_slopes, gradient[:, 3:]
         turning -= np.einsum("gij,gj->gi", eliminated.carry, shifting)
         alone = np.einsum("gij,gj->gi", eliminated.shift_covariance, shifting)
         pull = self.right(views, np.einsum("gki,gi->gk", state.slopes[..., 3:], alone))
@@ -588,7 +591,7 @@ class ObjectModel:
 
         def total(tried: _Tried) -> float:
             rough = 0.0 if roughness is None else roughness.penalty(tried.path, len(still))
-            return tried.solution.cost + tried.views.seen + rough
+            return tried.solution.cost + self._lacking * tried.views.seen + rough
 
         old = total(now)
         for length in 0.25 ** np.arange(6):

@@ -38,12 +38,15 @@ class Prior:
         Length w on which a blob falls off, as exp(−r / w) / r [length].
     power:
         Variance of a mode of the object at k = 0.
+    looseness:
+        Variance over the likeliest one.
     """
 
     distance: Array
     density: Array
     width: float
     power: float
+    looseness: float = np.inf
 
     @classmethod
     def of(cls, low: LowBand) -> Prior:

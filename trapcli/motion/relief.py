@@ -21,6 +21,7 @@ Array = NDArray[np.float64]
 _FACTORS = 2.0, 0.5
 _WIDE = np.deg2rad(30.0)  # tilt beyond which views differ enough to tell it
 _MOST = 6  # times that a better tilt is followed
+_HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
 _BETTER = 1.0  # gain that counts, in units of the misfit
 
 
@@ -30,7 +31,10 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> tuple[Fit, Asses
         for factor in _FACTORS:
             if factor * tilt(fit.path.R) > _FACTORS[0] * _WIDE:
                 continue
-            other = _refitted(low, fit, tilted(fit.path, factor, fit.spline))
+            path = tilted(fit.path, factor, fit.spline)
+            if _misfit(fit, path) > _HOPELESS * fit.cost:
+                continue
+            other = _refitted(low, fit, path)
             if score(*other) < score(fit, assessment) - _BETTER:
                 fit, assessment = other
                 break
@@ -59,6 +63,10 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
     swing, spin, mean = _swings(path.R[first])
     R = mean @ Rotation.from_rotvec(factor * swing).as_matrix() @ spin
     return Path(time, R, path.omega[first]).near(spline, path.time)
+
+
+def _misfit(fit: Fit, path: Path) -> float:
+    return fit.model.cost(path.R[-len(fit.low.time) :], fit.low.modes)
 
 
 def _refitted(low: LowBand, fit: Fit, path: Path) -> tuple[Fit, Assessment]:
