@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from trapcli.motion.path import Path, Spline, _right_jacobian, align, cross_matrix
+from trapcli.motion.path import Path, Spline, _right_jacobian, align, cross_matrix, deviation
 
 SIGMA = np.diag([1.0, 1.0, -1.0])
 
@@ -159,3 +159,17 @@ def test_the_simplest_path_nearby_has_lost_its_wiggles() -> None:
     assert roughness(simple) < 0.1 * roughness(rough)
     # what only as many intervals can follow stays as it is
     assert rough.simplest(fine, 1e-9) is rough
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_way_from_one_path_to_another_is_free_of_the_gauge(
+    rng: np.random.Generator, mirrored: bool
+) -> None:
+    R = Rotation.random(80, random_state=3).as_matrix()
+    way = 0.01 * rng.normal(size=(80, 3))
+    other = Rotation.random(random_state=4).as_matrix() @ R @ Rotation.from_rotvec(way).as_matrix()
+    found = deviation(R, SIGMA @ other @ SIGMA if mirrored else other)
+    # a turn of the object moves all frames alike, in its coordinates
+    apart = np.einsum("nij,nj->ni", R, found - way)
+    assert np.ptp(apart, axis=0).max() < 2e-4
+    assert np.abs(np.einsum("nij,nj->i", R, found)).max() / 80 < 2e-4

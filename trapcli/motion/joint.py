@@ -24,7 +24,7 @@ from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
 from trapcli.motion.path import Spline, align
-from trapcli.motion.relief import relieved, score
+from trapcli.motion.relief import relieved, score, widened
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
     COARSE,
@@ -223,8 +223,10 @@ def _refined(
     """Look for a likelier tilt, give the motion as many knots as it needs, and the object its sharp edges."""
     turns_in_plane = fit.axes == (2,)  # what there is besides, a richer motion has told
     hopeless = fit.cost > _HOPELESS * assessment.degrees
+    found = [(fit, assessment)]
     if not (turns_in_plane or hopeless):
-        fit, assessment = relieved(low, fit, assessment)
+        found = relieved(low, fit, assessment)
+        fit, assessment = found[0]
         if not knots:
             fit, assessment = _uncrowded(fit, assessment, time)
     if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
@@ -235,8 +237,8 @@ def _refined(
         if certified(finer, told) and _as_well(finer, told, fit, assessment):
             fit, assessment = finer, told
     if not certified(fit, assessment):
-        return _with_model_error(fit, assessment)
-    return fit, assessment
+        fit, assessment = _with_model_error(fit, assessment)
+    return fit, widened(fit, assessment, len(time), found)
 
 
 def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Assessment]:

@@ -1,9 +1,9 @@
 """What an object may be like before it is known: a random field that the frames' mean power describes.
 
 It is taken for a sum of blobs of one size with random amplitudes, which follow how much of it lies at a
-distance from its centre. That is told by the mean of all frames, whatever the motion; how large and how strong
-the blobs are is told by the evidence (MacKay 1992, DOI 10.1162/neco.1992.4.3.415). Amplitudes that the frames do
-not determine then stay near 0 and add no noise to the motion.
+distance from its centre. That is told by the mean of all frames, whatever the motion; how large and how
+strong the blobs are is told by the evidence (MacKay 1992, DOI 10.1162/neco.1992.4.3.415). Amplitudes that the
+frames do not determine then stay near 0 and add no noise to the motion.
 
 What lies inside edges has a power that falls as k⁻⁴, that of a random medium of two densities as
 (1 + w²k²)⁻² (Debye, Anderson and Brumberger 1957, DOI 10.1063/1.1722830). Blobs have this power: where it is

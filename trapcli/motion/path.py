@@ -184,13 +184,27 @@ def align(R: Array, reference: Array) -> tuple[Array, bool]:
     sigma = np.diag([1.0, 1.0, -1.0])
     for mirrored in (False, True):
         other = sigma @ R @ sigma if mirrored else R
-        u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", other, reference))
-        constant = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        constant = _between(other, reference)
         angles = Rotation.from_matrix(np.swapaxes(constant @ reference, 1, 2) @ other).magnitude()
         if best is None or angles.mean() < best[0].mean():
             best = angles, mirrored
     assert best is not None
     return best
+
+
+def deviation(R: Array, reference: Array) -> Array:
+    """Return ``(N, 3)`` rotation vectors in the lab from R to a reference, their gauge removed [rad]."""
+    sigma = np.diag([1.0, 1.0, -1.0])
+    if align(R, reference)[1]:
+        reference = sigma @ reference @ sigma
+    turns = np.swapaxes(R, 1, 2) @ _between(R, reference) @ reference
+    return Rotation.from_matrix(turns).as_rotvec()
+
+
+def _between(R: Array, reference: Array) -> Array:
+    """Return the constant rotation of the object that brings a path nearest to another."""
+    u, _, vt = np.linalg.svd(np.einsum("nij,nkj->ik", R, reference))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
 def _right_jacobian(delta: Array) -> Array:

@@ -3,10 +3,14 @@
 Views from nearly the same side look almost alike for a deeper object that turns less (Belhumeur, Kriegman and
 Yuille 1999, DOI 10.1023/A:1008154927611). The misfit then has several shallow minima along that way, and what
 an object may be like differs between them; a search downhill stays in the one that it comes upon first. So
-the motion is tilted more and less, and fitted again each time with the object's model that suits it.
+the motion is tilted more and less, and fitted again each time with the object's model that suits it. What of
+these explains the frames nearly as well as the best tells how far that may be off, where the curvature of its
+misfit claims less.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,33 +18,64 @@ from scipy.spatial.transform import Rotation
 
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel
-from trapcli.motion.path import Path, Spline
+from trapcli.motion.path import Path, Spline, deviation
 
 Array = NDArray[np.float64]
+Scored = tuple[Fit, Assessment]
 
-_FACTORS = 2.0, 0.5
+_FACTORS = 2.0, 0.5, 4.0
 _WIDE = np.deg2rad(30.0)  # tilt beyond which views differ enough to tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
 _BETTER = 1.0  # gain that counts, in units of the misfit
 
 
-def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
-    """Return the best fit among those with other tilts of the viewing direction, if they are all small."""
+def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
+    """Return this fit and others with other tilts of the viewing direction, where it is small, the best first.
+
+    Parameters
+    ----------
+    low:
+        The frames, with all modes.
+    fit, assessment:
+        A motion and what is known of it.
+    """
+    found = [(fit, assessment)]
     for _ in range(_MOST):
+        best = min(found, key=lambda one: score(*one))
         for factor in _FACTORS:
-            if factor * tilt(fit.path.R) > _FACTORS[0] * _WIDE:
+            path = tilted(best[0].path, factor, fit.spline)
+            if tilt(path.R) > _FACTORS[0] * _WIDE or _misfit(best[0], path) > _HOPELESS * best[0].cost:
                 continue
-            path = tilted(fit.path, factor, fit.spline)
-            if _misfit(fit, path) > _HOPELESS * fit.cost:
-                continue
-            other = _refitted(low, fit, path)
-            if score(*other) < score(fit, assessment) - _BETTER:
-                fit, assessment = other
+            found.append(_refitted(low, best[0], path))
+            if score(*found[-1]) < score(*best) - _BETTER:
                 break
         else:
             break
-    return fit, assessment
+    return sorted(found, key=lambda one: score(*one))
+
+
+def widened(fit: Fit, assessment: Assessment, n: int, found: list[Scored]) -> Assessment:
+    """Return the errors so that other tilts lie as many of them away as they are less likely.
+
+    Parameters
+    ----------
+    fit, assessment:
+        A motion for which `found` was searched.
+    n:
+        How many of the path's times are those of frames.
+    found:
+        Fits, the best first.
+    """
+    size = 3 * fit.spline.size
+    covariance = assessment.covariance.reshape(size, size)
+    best, *others = found
+    for other in others:
+        apart = max(score(*other) - score(*best), 1.0)  # in squares of standard deviations
+        way = fit.spline.fit(fit.path.time[:n], deviation(best[0].path.R[:n], other[0].path.R[:n])).ravel()
+        told = float(way @ np.linalg.lstsq(covariance, way, rcond=1e-12)[0])
+        covariance = covariance + max(1 / apart - 1 / max(told, 1e-300), 0.0) * np.outer(way, way)
+    return replace(assessment, covariance=covariance.reshape(assessment.covariance.shape))
 
 
 def score(fit: Fit, assessment: Assessment) -> float:

@@ -1,0 +1,107 @@
+"""How far the object turns out of the image plane, on paths of closed form and on ambiguous data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from tests.motion.test_object_model import FINE_BAND, FRAMES, RADIUS, low_band
+from trapcli.motion.object_model import ObjectModel
+from trapcli.motion.path import Path, Spline, align, deviation
+from trapcli.motion.relief import relieved, score, tilt, tilted, widened
+from trapcli.simulation.phantoms import Blobs
+
+Array = NDArray[np.float64]
+
+SPLINE = Spline(0.0, 1.0, 12)
+GROUPS = np.linspace(0, 1, FRAMES)
+TIMES = np.concatenate([GROUPS, SPLINE.grid, GROUPS])
+
+
+def rocking(amplitude: float, spin: float, times: Array, seed: int = 0) -> Path:
+    """Return a path whose views swing about their mean, while it spins about the optical axis."""
+    time = np.linspace(0, 1, 1201)
+    object_side = Rotation.random(random_state=seed)
+    angle = amplitude * np.sin(2 * np.pi * time)
+    axis = np.stack([np.cos(0.7 * time), np.sin(0.7 * time), 0 * time], axis=1)
+    swing = Rotation.from_rotvec(angle[:, None] * axis)
+    turn = Rotation.from_rotvec(spin * time[:, None] * np.array([0.0, 0.0, 1.0]))
+    R = (object_side * swing * turn).as_matrix()
+    return Path(time, R, np.zeros((len(time), 3))).near(SPLINE, times)
+
+
+def apart(one: Path, other: Path) -> float:
+    return float(align(one.R[:FRAMES], other.R[:FRAMES])[0].mean())
+
+
+@pytest.mark.parametrize("spin", [0.0, 1.0, 7.0])
+def test_tilt_is_the_angle_of_the_views_to_their_mean(spin: float) -> None:
+    assert tilt(rocking(0.2, spin, GROUPS).R) == pytest.approx(0.2 / np.sqrt(2), rel=0.03)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("spin", [0.0, 3.0])
+def test_a_tilted_path_swings_more_or_less_and_spins_as_before(factor: float, spin: float) -> None:
+    path = rocking(0.1, spin, TIMES)
+    assert apart(tilted(path, factor, SPLINE), rocking(factor * 0.1, spin, TIMES)) < 0.03 * factor * 0.1
+
+
+def test_a_path_that_is_not_tilted_stays() -> None:
+    path = rocking(0.15, 2.0, TIMES)
+    assert apart(tilted(path, 1.0, SPLINE), path) < 1e-3
+
+
+def small_turns(seed: int) -> Path:
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 1, 400)
+    rate = rng.normal(size=(3, 3))
+    phase = rng.uniform(size=3)
+    omega = np.cos(2 * np.pi * (time[:, None] * [0.8, 1.3, 2.1] + phase)) @ rate
+    return Path.smooth(SPLINE, SPLINE.fit(time, 0.25 * omega), np.linspace(0, 1, 801)).near(SPLINE, TIMES)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_a_tilt_that_is_too_small_is_left_and_errors_are_told(seed: int) -> None:
+    path = small_turns(seed)
+    rng = np.random.default_rng(seed)
+    place = rng.normal(size=(8, 3))
+    place *= 0.75 * RADIUS / np.linalg.norm(place, axis=1).max()
+    thing = Blobs(rng.uniform(0.3, 1, 8), place, np.tile((0.1 * RADIUS) ** 2 * np.eye(3), (8, 1, 1)))
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    low = low_band(thing, views, seed, band=FINE_BAND, noise=0.003)
+    start = tilted(path, 0.2, SPLINE)
+    model = ObjectModel.likeliest(low, FINE_BAND, start.R[-FRAMES:])
+    fit = model.fit(start, GROUPS, SPLINE)
+    before = model.assess(fit)
+    found = relieved(low, fit, before)
+    best, assessment = found[0]
+    assert score(best, assessment) <= score(fit, before)
+    assert apart(best.path, path) < 0.7 * apart(fit.path, path)
+    wide = widened(best, assessment, FRAMES, found)
+    # covariances grow, and never shrink
+    size = 3 * SPLINE.size
+    more = (wide.covariance - assessment.covariance).reshape(size, size)
+    assert np.linalg.eigvalsh(more).min() > -1e-9 * np.trace(more)
+
+
+def test_another_tilt_lies_as_many_errors_away_as_it_is_less_likely() -> None:
+    path = small_turns(0)
+    thing = Blobs.random(np.random.default_rng(0), radius=RADIUS)
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    model = ObjectModel(low_band(thing, views, 0, band=12 / RADIUS, noise=0.003), 12 / RADIUS)
+    fit = model.fit(path, GROUPS, SPLINE, steps=1)
+    assessment = model.assess(fit)
+    other = replace(fit, path=tilted(fit.path, 1.5, SPLINE), cost=fit.cost + 4.0)
+    wide = widened(fit, assessment, FRAMES, [(fit, assessment), (other, assessment)])
+    size = 3 * SPLINE.size
+    way = SPLINE.fit(GROUPS, deviation(fit.path.R[:FRAMES], other.path.R[:FRAMES])).ravel()
+
+    def away(covariance: Array) -> float:
+        return float(way @ np.linalg.solve(covariance.reshape(size, size), way))
+
+    assert away(assessment.covariance) > 100
+    assert away(wide.covariance) == pytest.approx(4.0, rel=0.01)
