@@ -9,9 +9,10 @@ transforms on the lattice. The real part of a mode sees only the part of the obj
 centre, the imaginary part the odd one, so that the normal matrix falls into two blocks of half the size.
 
 The object follows the noise as well: on the average the misfit lacks as much as the number of amplitudes that
-the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. What an amplitude has
-beside the noise costs 1 / L in a prior of L times the right variance. So the misfit and 1 − 1 / L times that
-number are minimized together; their mean does not favour motions that see more, or less.
+the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. Both together are
+minimized; their mean over the noise does not favour motions that see more. What an amplitude has beside the
+noise costs 1 / L in a prior of L times the right variance; where all views are from one side, and what is seen
+depends on the motion most, that counts as well.
 
 What the object holds of the noise turns with the motion as well. On the average it adds the same matrix T to
 the normal matrix J of the motion and to the covariance of the gradient, as the noise in the object and the
@@ -48,6 +49,9 @@ ComplexArray = NDArray[np.complex128]
 GUARDS = (3.0, 4.5, 6.0)
 """Guards of the lattice that are tried, see `ObjectModel`."""
 
+LOOSE = 4.0
+"""Variance of a prior over the likeliest: edges are no samples of it, and must not be smoothed away."""
+
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # width of a blob in units of `spacing`, where it is not known
 _TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
@@ -56,7 +60,6 @@ _SEARCH = (
     (12.0, ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0)), 20),
     (np.inf, ((0.0, 0.0), (0.2, 0.0), (0.0, -0.5)), 10),
 )  # for the likeliest, roughly at first: band times radius up to which it explains, simplex, looks
-_LOOSE = 4.0  # edges are no samples of a prior, and must not be smoothed away where they are seen
 _PROBES = 2  # objects that are fitted to noise alone
 _NEAR = 1.5  # misfit per degree of freedom up to which it may tell kicks from a wrong motion
 _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
@@ -259,7 +262,7 @@ class ObjectModel:
                 },
             ).x
         found = prior(best)
-        return replace(found, power=_LOOSE * found.power, looseness=_LOOSE)
+        return replace(found, power=LOOSE * found.power)
 
     @property
     def data_count(self) -> float:

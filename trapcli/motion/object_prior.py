@@ -39,7 +39,7 @@ class Prior:
     power:
         Variance of a mode of the object at k = 0.
     looseness:
-        Variance over the likeliest one.
+        Variance over the likeliest one, if what the object itself adds to the misfit is to count.
     """
 
     distance: Array

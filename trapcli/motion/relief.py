@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.object_model import Assessment, Fit, ObjectModel
+from trapcli.motion.object_model import LOOSE, Assessment, Fit, ObjectModel
 from trapcli.motion.path import Path, Spline, deviation
 
 Array = NDArray[np.float64]
@@ -31,7 +31,7 @@ _BETTER = 1.0  # gain that counts, in units of the misfit
 
 
 def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
-    """Return this fit and others with other tilts of the viewing direction, where it is small, the best first.
+    """Return this fit and, where views are much alike, others with other tilts of them; the best first.
 
     Parameters
     ----------
@@ -40,12 +40,14 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
     fit, assessment:
         A motion and what is known of it.
     """
-    found = [(fit, assessment)]
+    if tilt(fit.path.R) > _WIDE:
+        return [(fit, assessment)]
+    found = [(fit, assessment), _refitted(low, fit, fit.path)]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
         for factor in _FACTORS:
             path = tilted(best[0].path, factor, fit.spline)
-            if tilt(path.R) > _FACTORS[0] * _WIDE or _misfit(best[0], path) > _HOPELESS * best[0].cost:
+            if _misfit(best[0], path) > _HOPELESS * best[0].cost:
                 continue
             found.append(_refitted(low, best[0], path))
             if score(*found[-1]) < score(*best) - _BETTER:
@@ -107,6 +109,8 @@ def _misfit(fit: Fit, path: Path) -> float:
 def _refitted(low: LowBand, fit: Fit, path: Path) -> tuple[Fit, Assessment]:
     groups = low.time
     model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(groups) :])
+    assert model.prior is not None
+    model = ObjectModel(low, model.band, guard=model.guard, prior=replace(model.prior, looseness=LOOSE))
     other = model.fit(path, groups, fit.spline, smooth=fit.roughness is not None)
     return other, model.assess(other)
 
