@@ -11,8 +11,8 @@ centre, the imaginary part the odd one, so that the normal matrix falls into two
 The object follows the noise as well: on the average the misfit lacks as much as the number of amplitudes that
 the frames determine, tr A N⁻¹ Aᵀ, which grows with what a motion sees of Fourier space. Both together are
 minimized; their mean over the noise does not favour motions that see more. What an amplitude has beside the
-noise costs 1 / L in a prior of L times the right variance; where all views are from one side, and what is seen
-depends on the motion most, that counts as well.
+noise costs 1 / L in a prior of L times the right variance; where all views are from one side, and what is
+seen depends on the motion most, that counts as well.
 
 What the object holds of the noise turns with the motion as well. On the average it adds the same matrix T to
 the normal matrix J of the motion and to the covariance of the gradient, as the noise in the object and the

@@ -198,7 +198,7 @@ def deviation(R: Array, reference: Array) -> Array:
     if align(R, reference)[1]:
         reference = sigma @ reference @ sigma
     turns = np.swapaxes(R, 1, 2) @ _between(R, reference) @ reference
-    return Rotation.from_matrix(turns).as_rotvec()
+    return np.asarray(Rotation.from_matrix(turns).as_rotvec())
 
 
 def _between(R: Array, reference: Array) -> Array:
