@@ -75,6 +75,7 @@ _CROWDED = 0.55  # share of the coefficients that the frames determine from whic
 _HOPELESS = 6.0  # misfit per degree of freedom that no knots mend
 _MOST_KNOTS = 400  # the same at most: matrices grow with their square
 _NEAR = np.deg2rad(1.0)  # mean angle to a motion that another one may have which is fitted in its place
+_LEAST_SHARE = 0.25  # of the noise, to which it is lowered: of clean frames it stands for model errors
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _PATIENCE = 5.0  # of a look with a coarse model at such a rotation, in units of what noise gives
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
@@ -206,7 +207,7 @@ def _quieter(
 
     Too much of it would hide a wrong motion's misfit, and makes motions look better that see less.
     """
-    share = fit.cost / assessment.degrees
+    share = max(fit.cost / assessment.degrees, _LEAST_SHARE)
     if share >= 1 - NOISE_ERROR:
         return stack, fit, assessment
     stack = replace(stack, low=replace(stack.low, variance=share * stack.low.variance))
