@@ -22,7 +22,7 @@ from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
-from trapcli.motion.object_model import Assessment, Fit, ObjectModel
+from trapcli.motion.object_model import Assessment, Fit, ObjectModel, refitted
 from trapcli.motion.path import Spline, align
 from trapcli.motion.relief import relieved, score, widened
 from trapcli.motion.types import ReducedMap
@@ -212,10 +212,7 @@ def _quieter(
         return stack, fit, assessment
     stack = replace(stack, low=replace(stack.low, variance=share * stack.low.variance))
     low = _fine_groups(stack, used, pace)
-    model = ObjectModel.likeliest(low, fit.model.band, fit.R)
-    smooth = fit.roughness is not None
-    fit = model.fit(fit.path, low.time, fit.spline, smooth=smooth, axes=fit.axes)
-    return stack, fit, model.assess(fit)
+    return stack, *refitted(low, fit, fit.path)
 
 
 def _refined(

@@ -218,13 +218,13 @@ class ObjectModel:
         return cls(fit.low, band, guard=fit.model.guard, prior=fit.model.prior, variance=variance)
 
     @classmethod
-    def likeliest(cls, low: LowBand, band: float, R: Array) -> ObjectModel:
+    def likeliest(cls, low: LowBand, band: float, R: Array, looseness: float = np.inf) -> ObjectModel:
         """Return the model that explains ``(G, 3, 3)`` rotations best, in as few amplitudes as it takes.
 
         The prior is told by its evidence on the finest lattice; the guard then by Akaike's criterion (1974,
         DOI 10.1109/TAC.1974.1100705): a smooth object needs a coarser lattice than one with sharp edges.
         """
-        prior = cls._likeliest_prior(low, band, GUARDS[-1], R)
+        prior = replace(cls._likeliest_prior(low, band, GUARDS[-1], R), looseness=looseness)
 
         def surprise(model: ObjectModel) -> float:
             views = model.views(R)
@@ -668,6 +668,26 @@ class ObjectModel:
             folded[n, count - 1] = both[0, -1]
             folded[n, count:] = -np.sqrt(2) * both[1, :-1]
         return folded
+
+
+def refitted(low: LowBand, fit: Fit, path: Path, looseness: float = np.inf) -> tuple[Fit, Assessment]:
+    """Fit again from another path, with the likeliest model along it.
+
+    Parameters
+    ----------
+    low:
+        The frames, with all modes.
+    fit:
+        Says the band, the spline, the axes and whether roughness counts.
+    path:
+        Where to start, at the times of that of `fit`.
+    looseness:
+        Of the prior.
+    """
+    model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(low.time) :], looseness)
+    smooth = fit.roughness is not None
+    again = model.fit(path, low.time, fit.spline, smooth=smooth, axes=fit.axes)
+    return again, model.assess(again)
 
 
 @dataclass(frozen=True)

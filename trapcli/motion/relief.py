@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.object_model import LOOSE, Assessment, Fit, ObjectModel
+from trapcli.motion.object_model import LOOSE, Assessment, Fit, refitted
 from trapcli.motion.path import Path, Spline, deviation
 
 Array = NDArray[np.float64]
@@ -42,14 +42,14 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
     """
     if tilt(fit.path.R) > _WIDE:
         return [(fit, assessment)]
-    found = [(fit, assessment), _refitted(low, fit, fit.path)]
+    found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
         for factor in _FACTORS:
             path = tilted(best[0].path, factor, fit.spline)
             if _misfit(best[0], path) > _HOPELESS * best[0].cost:
                 continue
-            found.append(_refitted(low, best[0], path))
+            found.append(refitted(low, best[0], path, LOOSE))
             if score(*found[-1]) < score(*best) - _BETTER:
                 break
         else:
@@ -104,15 +104,6 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
 
 def _misfit(fit: Fit, path: Path) -> float:
     return fit.model.cost(path.R[-len(fit.low.time) :], fit.low.modes)
-
-
-def _refitted(low: LowBand, fit: Fit, path: Path) -> tuple[Fit, Assessment]:
-    groups = low.time
-    model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(groups) :])
-    assert model.prior is not None
-    model = ObjectModel(low, model.band, guard=model.guard, prior=replace(model.prior, looseness=LOOSE))
-    other = model.fit(path, groups, fit.spline, smooth=fit.roughness is not None)
-    return other, model.assess(other)
 
 
 def _swings(R: Array) -> tuple[Array, Array, Array]:
