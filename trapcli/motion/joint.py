@@ -234,6 +234,8 @@ def _refined(
         # a prior told at low frequencies may be wrong so far beyond
         if certified(finer, told) and _as_well(finer, told, fit, assessment):
             fit, assessment = finer, told
+    if not (turns_in_plane or hopeless):
+        fit, assessment = _placed(fit, assessment)
     if not certified(fit, assessment):
         fit, assessment = _with_model_error(fit, assessment)
     return fit, widened(fit, assessment, len(time), found)
@@ -258,6 +260,14 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
         if score(richer, told) > score(fit, assessment):
             return fit, assessment
         fit, assessment = richer, told
+
+
+def _placed(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
+    """Fit again with an object that lies where this one was found, if it fits as well."""
+    model = fit.model.placed(fit)
+    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
+    told = model.assess(again)
+    return (again, told) if _as_well(again, told, fit, assessment) else (fit, assessment)
 
 
 def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:

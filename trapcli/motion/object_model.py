@@ -60,6 +60,7 @@ _SEARCH = (
     (12.0, ((0.0, 0.0), (0.4, 0.0), (0.0, 1.0)), 20),
     (np.inf, ((0.0, 0.0), (0.2, 0.0), (0.0, -0.5)), 10),
 )  # for the likeliest, roughly at first: band times radius up to which it explains, simplex, looks
+_PLACINGS = 4  # times that it is told where the object lies
 _PROBES = 2  # objects that are fitted to noise alone
 _NEAR = 1.5  # misfit per degree of freedom up to which it may tell kicks from a wrong motion
 _MOST_NOISE = 0.9  # share that noise may have of a normal matrix
@@ -263,6 +264,24 @@ class ObjectModel:
             ).x
         found = prior(best)
         return replace(found, power=LOOSE * found.power)
+
+    def placed(self, fit: Fit) -> ObjectModel:
+        """Return the model whose prior says where the object of a fit lies.
+
+        Told by the evidence, like the prior itself, and loosened then.
+        """
+        assert self.prior is not None
+
+        def model(prior: Prior) -> ObjectModel:
+            return ObjectModel(self.low, self.band, guard=self.guard, prior=prior, variance=self.variance)
+
+        prior = replace(self.prior, power=self.prior.power / LOOSE)
+        for _ in range(_PLACINGS):
+            tight = model(prior)
+            views = tight.views(fit.R)
+            amplitude = tight._solved(views, fit.low.modes).amplitude
+            prior = prior.placed(self.low, self.position, amplitude**2, views.spread)
+        return model(replace(prior, power=LOOSE * prior.power))
 
     @property
     def data_count(self) -> float:
@@ -709,6 +728,13 @@ class Views:
     def volume(self) -> float:
         """Logarithm of the determinant of the object's normal matrix."""
         return -2 * float(sum(np.log(np.diag(half)).sum() for half in self.halves))
+
+    @property
+    def spread(self) -> Array:
+        """``(n,)`` variances that the frames and the prior leave the amplitudes."""
+        even, odd = (np.sum(half**2, axis=0) for half in self.halves)
+        both = 0.5 * (even[:-1] + odd)
+        return np.concatenate([both, even[-1:], both[::-1]])
 
     def solve(self, right: Array) -> Array:
         """Return the ``(n,)`` amplitudes for an ``(n,)`` right-hand side."""

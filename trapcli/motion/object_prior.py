@@ -5,6 +5,10 @@ distance from its centre. That is told by the mean of all frames, whatever the m
 strong the blobs are is told by the evidence (MacKay 1992, DOI 10.1162/neco.1992.4.3.415). Amplitudes that the
 frames do not determine then stay near 0 and add no noise to the motion.
 
+Once the motion is known, the evidence tells in which places there is more of the object than elsewhere: the
+variance of amplitudes there becomes the mean square of those that the frames determine (MacKay 1992, as
+above). Most of a ball about an object is empty, and what is empty needs no amplitudes.
+
 What lies inside edges has a power that falls as k⁻⁴, that of a random medium of two densities as
 (1 + w²k²)⁻² (Debye, Anderson and Brumberger 1957, DOI 10.1063/1.1722830). Blobs have this power: where it is
 taken to fall faster, sharp objects seem to turn less than they do.
@@ -12,10 +16,11 @@ taken to fall faster, sharp objects seem to turn less than they do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from trapcli.motion.low_band import LowBand
 
@@ -24,6 +29,8 @@ Array = NDArray[np.float64]
 _RESOLUTION = 0.08  # of the radial density, in radii of the object
 _SHELLS = 101
 _LEAST = 0.01  # of the largest radial density: what may lie where none is seen
+_VICINITY = 0.1  # over which the variance of amplitudes is told together, in radii of the object
+_BEFOREHAND = 0.02  # amplitudes in each vicinity that count as told, of the variance that was there
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,9 @@ class Prior:
         Variance of a mode of the object at k = 0.
     looseness:
         Variance over the likeliest one, if what the object itself adds to the misfit is to count.
+    place, share, vicinity:
+        ``(L, 3)`` places [length] and the variance there, in units of that at their distance; over which
+        length it is told [length]. None where only distances count.
     """
 
     distance: Array
@@ -47,6 +57,9 @@ class Prior:
     width: float
     power: float
     looseness: float = np.inf
+    place: Array | None = None
+    share: Array | None = None
+    vicinity: float = 0.0
 
     @classmethod
     def of(cls, low: LowBand) -> Prior:
@@ -70,8 +83,37 @@ class Prior:
 
     def variance(self, position: Array) -> Array:
         """Return ``(n,)`` variances of the amplitudes at ``(n, 3)`` places, 1 on the average."""
-        variance = np.interp(np.linalg.norm(position, axis=1), self.distance, self.density)
+        variance = self._at_distance(position)
+        if self.place is not None and self.share is not None:
+            variance = variance * (_near(position, self.place, 0.5 * self.vicinity) @ self.share)
         return np.asarray(variance / variance.mean())
+
+    def placed(self, low: LowBand, position: Array, square: Array, spread: Array) -> Prior:
+        """Return the prior with the variance that each vicinity is told to have.
+
+        Parameters
+        ----------
+        low:
+            Says how large the object is.
+        position:
+            ``(n, 3)`` places of amplitudes, opposite ones at opposite ends.
+        square, spread:
+            ``(n,)`` squares of the likeliest amplitudes and variances that the frames leave them.
+        """
+        vicinity, before = _VICINITY * low.radius, self.variance(position)
+        near = _near(position, position, vicinity)
+
+        def together(values: Array) -> Array:
+            # even and odd amplitudes stay apart only where opposite places are alike
+            return np.asarray(near @ (0.5 * (values + values[::-1])) + _BEFOREHAND)
+
+        after = before * together(square / before) / together(1 - spread / before)
+        share = after / self._at_distance(position)
+        power = self.power * float(after.mean())  # the variance before is 1 on the average
+        return replace(self, power=power, place=position, share=share, vicinity=vicinity)
+
+    def _at_distance(self, position: Array) -> Array:
+        return np.interp(np.linalg.norm(position, axis=1), self.distance, self.density)
 
     def spectrum(self, k: Array) -> Array:
         """Return standard deviations of modes at spatial frequencies of length `k` [rad / length]."""
@@ -87,3 +129,9 @@ def radial_density(low: LowBand, distance: Array) -> Array:
     k = np.hypot(low.k[:, 0], low.k[:, 1])
     mean = low.modes.mean(axis=0).real * np.exp(-0.5 * (_RESOLUTION * low.radius * k) ** 2)
     return np.asarray(np.sinc(np.outer(distance, k) / np.pi) @ (k * mean))
+
+
+def _near(position: Array, place: Array, length: float) -> Array:
+    """Return ``(n, L)`` weights of places about positions, Gaussian of a standard deviation, of sum 1."""
+    weight = np.exp(-0.5 * (cdist(position, place) / length) ** 2)
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
