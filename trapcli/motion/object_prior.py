@@ -113,7 +113,7 @@ class Prior:
         return replace(self, power=power, place=position, share=share, vicinity=vicinity)
 
     def _at_distance(self, position: Array) -> Array:
-        return np.interp(np.linalg.norm(position, axis=1), self.distance, self.density)
+        return np.asarray(np.interp(np.linalg.norm(position, axis=1), self.distance, self.density))
 
     def spectrum(self, k: Array) -> Array:
         """Return standard deviations of modes at spatial frequencies of length `k` [rad / length]."""
