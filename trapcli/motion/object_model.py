@@ -248,6 +248,7 @@ class ObjectModel:
             return model._cost(views, model.low.modes) + views.volume
 
         best = np.log(_TYPICAL)
+        told: list[Prior] = []
         for highest, spread, looks in _SEARCH:
             best = minimize(
                 surprise,
@@ -262,7 +263,9 @@ class ObjectModel:
                     "maxfev": looks,
                 },
             ).x
-        found = prior(best)
+            told.append(prior(best))
+        # fine parts that are expected too small bias the motion, those that are expected too large do not
+        found = max(told, key=lambda one: float(one.spectrum(np.array(band))))
         return replace(found, power=LOOSE * found.power)
 
     def placed(self, fit: Fit) -> ObjectModel:
