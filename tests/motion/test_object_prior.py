@@ -37,6 +37,14 @@ def round_blob(width: float) -> Blobs:
     return Blobs(np.ones(1), np.zeros((1, 3)), width**2 * np.eye(3)[None])
 
 
+def rod(seed: int, axis: Array) -> Blobs:
+    """Return six blobs about a line through the middle."""
+    rng, n = np.random.default_rng(seed), 6
+    line = np.outer(np.linspace(-0.8, 0.8, n), axis / np.linalg.norm(axis))
+    place = (line + 0.1 * rng.normal(size=(n, 3))) * RADIUS
+    return Blobs(rng.uniform(0.5, 1, n), place, np.tile((0.1 * RADIUS) ** 2 * np.eye(3), (n, 1, 1)))
+
+
 @pytest.mark.parametrize("width", [0.12, 0.2])
 def test_the_radial_density_of_a_gaussian_is_a_gaussian(path: Path, width: float) -> None:
     low = low_band(round_blob(width * RADIUS), path, 0, band=4 * FINE_BAND, noise=1e-5)
@@ -112,6 +120,60 @@ def test_the_misfit_is_that_of_the_data_alone(path: Path) -> None:
     fit = model.fit(on_grid(path, Spline(0.0, 1.0, KNOTS)), path.time, Spline(0.0, 1.0, KNOTS))
     assert fit.cost == pytest.approx(np.sum(np.abs(fit.normal.residual) ** 2), rel=1e-3)
     assert fit.cost / model.assess(fit).degrees == pytest.approx(1, abs=0.06)
+
+
+def test_the_variance_of_each_vicinity_is_told_by_its_amplitudes(path: Path) -> None:
+    """Amplitudes with noise, of two opposite lobes of variance 4 in a ball of variance 0.01."""
+    rng = np.random.default_rng(0)
+    axis = np.arange(-7, 8) / 8
+    cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    place = cube[np.linalg.norm(cube, axis=1) < 0.95]
+    lobe = np.abs(place[:, 0]) > 0.5
+    true, noise = np.where(lobe, 4.0, 0.01), 0.25
+    seen = np.sqrt(true + noise) * rng.normal(size=len(place))
+    low = replace(low_band(round_blob(1.0), path, 0), radius=1.0)
+    prior = Prior(np.zeros(1), np.ones(1), 0.1, 1.0)
+    for _ in range(20):
+        variance = prior.power * prior.variance(place)
+        gain = variance / (variance + noise)
+        square, spread = (gain * seen) ** 2 / prior.power, gain * noise / prior.power
+        prior = prior.placed(low, place, square, spread)
+    told = prior.power * prior.variance(place)
+    deep, far = np.abs(place[:, 0]) > 0.7, np.abs(place[:, 0]) < 0.3
+    assert told[deep].mean() == pytest.approx(4.0, rel=0.15)
+    assert np.median(told[far]) < 0.1
+    assert told == pytest.approx(told[::-1])
+
+
+def test_a_prior_that_knows_the_place_needs_fewer_amplitudes_and_explains_as_well(path: Path) -> None:
+    spline = Spline(0.0, 1.0, KNOTS)
+    low = low_band(rod(2, np.array([1.0, 0.0, 0.0])), path, 2, band=FINE_BAND, noise=0.01)
+    model = ObjectModel.likeliest(low, FINE_BAND, path.R)
+    fit = model.fit(on_grid(path, spline), path.time, spline, smooth=False)
+    placed = model.placed(fit)
+    again = placed.fit(fit.path, path.time, spline, smooth=False)
+    assert placed.views(fit.R).seen < 0.7 * model.views(fit.R).seen
+    assert again.cost / placed.assess(again).degrees == pytest.approx(1, abs=0.06)
+    assert placed.prior is not None
+    variance = placed.prior.variance(placed.position)
+    along = np.abs(placed.position[:, 0]) > 0.5 * RADIUS
+    beside = np.linalg.norm(placed.position[:, 1:], axis=1) > 0.5 * RADIUS
+    assert variance[along & ~beside].mean() > 10 * variance[beside].mean()
+
+
+@pytest.mark.slow
+def test_errors_get_smaller_where_it_is_told_in_which_places_the_object_lies(path: Path) -> None:
+    errors = []
+    spline = Spline(0.0, 1.0, 12)
+    for seed in range(8):
+        thing = rod(seed, np.random.default_rng(seed).normal(size=3))
+        low = low_band(thing, path, seed, band=FINE_BAND, noise=0.01)
+        model = ObjectModel.likeliest(low, FINE_BAND, path.R)
+        fit = model.fit(on_grid(path, spline), path.time, spline)
+        again = model.placed(fit).fit(fit.path, path.time, spline)
+        errors.append([align(one.R, path.R)[0].mean() for one in (fit, again)])
+    before, after = np.mean(errors, axis=0)
+    assert after < 0.9 * before
 
 
 @pytest.mark.slow

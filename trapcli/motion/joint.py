@@ -227,6 +227,7 @@ def _refined(
         fit, assessment = found[0]
         if not knots:
             fit, assessment = _uncrowded(fit, assessment, time)
+        fit, assessment = _told_anew(fit, assessment)
     if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
@@ -262,12 +263,26 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
         fit, assessment = richer, told
 
 
+def _told_anew(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
+    """Fit again with a prior that low frequencies alone tell, if that explains the images better.
+
+    Smooth objects are no samples of a field whose power has the form of that of edges: told in the whole
+    band, it may leave their fine parts too little.
+    """
+    again = _again(fit.model.roughly_told(fit), fit)
+    return min((fit, assessment), again, key=lambda one: score(*one))
+
+
 def _placed(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
     """Fit again with an object that lies where this one was found, if it fits as well."""
-    model = fit.model.placed(fit)
-    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
-    told = model.assess(again)
+    again, told = _again(fit.model.placed(fit), fit)
     return (again, told) if _as_well(again, told, fit, assessment) else (fit, assessment)
+
+
+def _again(model: ObjectModel, fit: Fit) -> tuple[Fit, Assessment]:
+    """Go on from a fit with another model of the same frames."""
+    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
+    return again, model.assess(again)
 
 
 def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:

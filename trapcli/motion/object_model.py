@@ -235,7 +235,9 @@ class ObjectModel:
         return models[int(np.argmin(in_parallel(surprise, models)))]
 
     @classmethod
-    def _likeliest_prior(cls, low: LowBand, band: float, guard: float, R: Array) -> Prior:
+    def _likeliest_prior(
+        cls, low: LowBand, band: float, guard: float, R: Array, rounds: int = len(_SEARCH)
+    ) -> Prior:
         about = Prior.of(low)
 
         def prior(logarithms: Array) -> Prior:
@@ -248,8 +250,7 @@ class ObjectModel:
             return model._cost(views, model.low.modes) + views.volume
 
         best = np.log(_TYPICAL)
-        told: list[Prior] = []
-        for highest, spread, looks in _SEARCH:
+        for highest, spread, looks in _SEARCH[:rounds]:
             best = minimize(
                 surprise,
                 best,
@@ -263,10 +264,14 @@ class ObjectModel:
                     "maxfev": looks,
                 },
             ).x
-            told.append(prior(best))
-        # fine parts that are expected too small bias the motion, those that are expected too large do not
-        found = max(told, key=lambda one: float(one.spectrum(np.array(band))))
+        found = prior(best)
         return replace(found, power=LOOSE * found.power)
+
+    def roughly_told(self, fit: Fit) -> ObjectModel:
+        """Return the model whose prior low frequencies alone tell, and from there the others by its form."""
+        assert self.prior is not None
+        prior = self._likeliest_prior(self.low, self.band, self.guard, fit.R, rounds=1)
+        return self._with(replace(prior, looseness=self.prior.looseness))
 
     def placed(self, fit: Fit) -> ObjectModel:
         """Return the model whose prior says where the object of a fit lies.
@@ -275,16 +280,16 @@ class ObjectModel:
         """
         assert self.prior is not None
 
-        def model(prior: Prior) -> ObjectModel:
-            return ObjectModel(self.low, self.band, guard=self.guard, prior=prior, variance=self.variance)
-
         prior = replace(self.prior, power=self.prior.power / LOOSE)
         for _ in range(_PLACINGS):
-            tight = model(prior)
+            tight = self._with(prior)
             views = tight.views(fit.R)
             amplitude = tight._solved(views, fit.low.modes).amplitude
             prior = prior.placed(self.low, self.position, amplitude**2, views.spread)
-        return model(replace(prior, power=LOOSE * prior.power))
+        return self._with(replace(prior, power=LOOSE * prior.power))
+
+    def _with(self, prior: Prior) -> ObjectModel:
+        return ObjectModel(self.low, self.band, guard=self.guard, prior=prior, variance=self.variance)
 
     @property
     def data_count(self) -> float:
