@@ -95,7 +95,7 @@ def test_another_tilt_lies_as_many_errors_away_as_it_is_less_likely() -> None:
     model = ObjectModel(low_band(thing, views, 0, band=12 / RADIUS, noise=0.003), 12 / RADIUS)
     fit = model.fit(path, GROUPS, SPLINE, steps=1)
     assessment = model.assess(fit)
-    other = replace(fit, path=tilted(fit.path, 1.5, SPLINE), cost=fit.cost + 4.0)
+    other = replace(fit, path=tilted(fit.path, 1.5, SPLINE), cost=fit.cost + 40.0)
     wide = widened(fit, assessment, FRAMES, [(fit, assessment), (other, assessment)])
     size = 3 * SPLINE.size
     way = SPLINE.fit(GROUPS, deviation(fit.path.R[:FRAMES], other.path.R[:FRAMES])).ravel()
@@ -105,3 +105,19 @@ def test_another_tilt_lies_as_many_errors_away_as_it_is_less_likely() -> None:
 
     assert away(assessment.covariance) > 100
     assert away(wide.covariance) == pytest.approx(4.0, rel=0.01)
+    # nor is a finer model believed that leaves the tilt that was found by more than an error
+    finer = replace(fit, path=tilted(fit.path, 1.5, SPLINE))
+    same = replace(fit, cost=fit.cost + 1e6)
+    assert away(widened(finer, assessment, FRAMES, [(fit, assessment), (same, assessment)]).covariance) < 1.01
+
+
+def test_a_motion_that_turns_enough_is_left_and_its_errors_too() -> None:
+    thing = Blobs.random(np.random.default_rng(0), radius=RADIUS)
+    path = rocking(0.6, 3.0, TIMES)
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    model = ObjectModel(low_band(thing, views, 0, band=12 / RADIUS, noise=0.003), 12 / RADIUS)
+    fit = model.fit(path, GROUPS, SPLINE, steps=1)
+    assessment = model.assess(fit)
+    found = relieved(model.low, fit, assessment)
+    assert [one for one, _ in found] == [fit]
+    assert widened(fit, assessment, FRAMES, found) is assessment

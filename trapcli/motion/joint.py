@@ -227,7 +227,8 @@ def _refined(
         fit, assessment = found[0]
         if not knots:
             fit, assessment = _uncrowded(fit, assessment, time)
-        fit, assessment = _told_anew(fit, assessment)
+        if len(found) == 1:
+            fit, assessment = _told_anew(fit, assessment)
     if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
         finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
@@ -235,7 +236,8 @@ def _refined(
         # a prior told at low frequencies may be wrong so far beyond
         if certified(finer, told) and _as_well(finer, told, fit, assessment):
             fit, assessment = finer, told
-    if not (turns_in_plane or hopeless):
+    # a depth that the frames leave open would confirm itself
+    if len(found) == 1 and not (turns_in_plane or hopeless):
         fit, assessment = _placed(fit, assessment)
     if not certified(fit, assessment):
         fit, assessment = _with_model_error(fit, assessment)

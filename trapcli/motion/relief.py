@@ -10,6 +10,7 @@ misfit claims less.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -24,10 +25,11 @@ Array = NDArray[np.float64]
 Scored = tuple[Fit, Assessment]
 
 _FACTORS = 2.0, 0.5, 4.0
-_WIDE = np.deg2rad(30.0)  # tilt beyond which views differ enough to tell it
+_WIDE = np.deg2rad(60.0)  # tilt beyond which views differ enough to tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
 _BETTER = 1.0  # gain that counts, in units of the misfit
+_OPEN = 10.0  # part of a difference of misfits that what is unknown of an object makes, as variance of 1
 
 
 def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
@@ -40,15 +42,12 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
     fit, assessment:
         A motion and what is known of it.
     """
-    if tilt(fit.path.R) > _WIDE:
+    if tilt(fit.path.R) > _WIDE or next(_alike(fit), None) is None:
         return [(fit, assessment)]
     found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
-        for factor in _FACTORS:
-            path = tilted(best[0].path, factor, fit.spline)
-            if _misfit(best[0], path) > _HOPELESS * best[0].cost:
-                continue
+        for path in _alike(best[0]):
             found.append(refitted(low, best[0], path, LOOSE))
             if score(*found[-1]) < score(*best) - _BETTER:
                 break
@@ -59,6 +58,9 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
 
 def widened(fit: Fit, assessment: Assessment, n: int, found: list[Scored]) -> Assessment:
     """Return the errors so that other tilts lie as many of them away as they are less likely.
+
+    What a finer model of the object changed of the best is one of them as well: where tilts are told that
+    badly, neither model knows better.
 
     Parameters
     ----------
@@ -72,9 +74,11 @@ def widened(fit: Fit, assessment: Assessment, n: int, found: list[Scored]) -> As
     size = 3 * fit.spline.size
     covariance = assessment.covariance.reshape(size, size)
     best, *others = found
-    for other in others:
-        apart = max(score(*other) - score(*best), 1.0)  # in squares of standard deviations
-        way = fit.spline.fit(fit.path.time[:n], deviation(best[0].path.R[:n], other[0].path.R[:n])).ravel()
+    if not others:
+        return assessment
+    for one, other in [(fit, best), *((best[0], other) for other in others)]:
+        apart = max((score(*other) - score(*best)) / _OPEN, 1.0)  # in squares of standard deviations
+        way = fit.spline.fit(fit.path.time[:n], deviation(one.path.R[:n], other[0].path.R[:n])).ravel()
         told = float(way @ np.linalg.lstsq(covariance, way, rcond=1e-12)[0])
         covariance = covariance + max(1 / apart - 1 / max(told, 1e-300), 0.0) * np.outer(way, way)
     return replace(assessment, covariance=covariance.reshape(assessment.covariance.shape))
@@ -102,8 +106,12 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
     return Path(time, R, path.omega[first]).near(spline, path.time)
 
 
-def _misfit(fit: Fit, path: Path) -> float:
-    return fit.model.cost(path.R[-len(fit.low.time) :], fit.low.modes)
+def _alike(fit: Fit) -> Iterator[Path]:
+    """Yield the path of a fit with other tilts that explain the frames nearly as well, before any fit."""
+    for factor in _FACTORS:
+        path = tilted(fit.path, factor, fit.spline)
+        if fit.model.cost(path.R[-len(fit.low.time) :], fit.low.modes) <= _HOPELESS * fit.cost:
+            yield path
 
 
 def _swings(R: Array) -> tuple[Array, Array, Array]:
