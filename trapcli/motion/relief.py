@@ -42,9 +42,11 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
     fit, assessment:
         A motion and what is known of it.
     """
-    if tilt(fit.path.R) > _WIDE or next(_alike(fit), None) is None:
+    if tilt(fit.path.R) > _WIDE:
         return [(fit, assessment)]
     found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
+    if next(_alike(fit), None) is None:
+        return [min(found, key=lambda one: score(*one))]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
         for path in _alike(best[0]):
