@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 Scored = tuple[Fit, Assessment]
 
 _FACTORS = 2.0, 0.5, 4.0
-_WIDE = np.deg2rad(60.0)  # tilt beyond which views differ enough to tell it
+_WIDE = np.deg2rad(30.0), np.deg2rad(60.0)  # tilts beyond which views mostly and surely tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
 _BETTER = 1.0  # gain that counts, in units of the misfit
@@ -42,10 +42,12 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
     fit, assessment:
         A motion and what is known of it.
     """
-    if tilt(fit.path.R) > _WIDE:
+    views_apart = tilt(fit.path.R)
+    others = views_apart <= _WIDE[1] and next(_alike(fit), None) is not None
+    if not others and views_apart > _WIDE[0]:
         return [(fit, assessment)]
     found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
-    if next(_alike(fit), None) is None:
+    if not others:
         return [min(found, key=lambda one: score(*one))]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
