@@ -77,7 +77,7 @@ def test_a_tilt_that_is_too_small_is_left_and_errors_are_told(seed: int) -> None
     model = ObjectModel.likeliest(low, FINE_BAND, start.R[-FRAMES:])
     fit = model.fit(start, GROUPS, SPLINE)
     before = model.assess(fit)
-    found = relieved(low, fit, before)
+    found = relieved(low, fit, before, FRAMES)
     best, assessment = found[0]
     assert score(best, assessment) <= score(fit, before)
     assert apart(best.path, path) < 0.7 * apart(fit.path, path)
@@ -118,6 +118,6 @@ def test_a_motion_that_turns_enough_is_left_and_its_errors_too() -> None:
     model = ObjectModel(low_band(thing, views, 0, band=12 / RADIUS, noise=0.003), 12 / RADIUS)
     fit = model.fit(path, GROUPS, SPLINE, steps=1)
     assessment = model.assess(fit)
-    found = relieved(model.low, fit, assessment)
+    found = relieved(model.low, fit, assessment, FRAMES)
     assert [one for one, _ in found] == [fit]
     assert widened(fit, assessment, FRAMES, found) is assessment

@@ -223,7 +223,7 @@ def _refined(
     hopeless = fit.cost > _HOPELESS * assessment.degrees
     found = [(fit, assessment)]
     if not (turns_in_plane or hopeless):
-        found = relieved(low, fit, assessment)
+        found = relieved(low, fit, assessment, len(time))
         fit, assessment = found[0]
         if not knots:
             fit, assessment = _uncrowded(fit, assessment, time)

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import LOOSE, Assessment, Fit, refitted
-from trapcli.motion.path import Path, Spline, deviation
+from trapcli.motion.path import Path, Spline, align, deviation
+from trapcli.motion.verdict import typical_error
 
 Array = NDArray[np.float64]
 Scored = tuple[Fit, Assessment]
@@ -29,11 +30,13 @@ _WIDE = np.deg2rad(30.0), np.deg2rad(60.0)  # tilts beyond which views mostly an
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
 _BETTER = 1.0  # gain that counts, in units of the misfit
+_SAME = 0.25  # mean angle between fits that are one motion, in units of its error
+_RULED_OUT = 9.0  # squares of standard deviations
 _OPEN = 10.0  # part of a difference of misfits that what is unknown of an object makes, as variance of 1
 
 
-def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
-    """Return this fit and, where views are much alike, others with other tilts of them; the best first.
+def relieved(low: LowBand, fit: Fit, assessment: Assessment, n: int) -> list[Scored]:
+    """Return the best fit and, where views are much alike, others with other tilts that may be right as well.
 
     Parameters
     ----------
@@ -41,13 +44,15 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
         The frames, with all modes.
     fit, assessment:
         A motion and what is known of it.
+    n:
+        How many of the path's times are those of frames.
     """
     views_apart = tilt(fit.path.R)
-    others = views_apart <= _WIDE[1] and next(_alike(fit), None) is not None
-    if not others and views_apart > _WIDE[0]:
+    alike = views_apart <= _WIDE[1] and next(_alike(fit), None) is not None
+    if not alike and views_apart > _WIDE[0]:
         return [(fit, assessment)]
     found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
-    if not others:
+    if not alike:
         return [min(found, key=lambda one: score(*one))]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
@@ -57,7 +62,10 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment) -> list[Scored]:
                 break
         else:
             break
-    return sorted(found, key=lambda one: score(*one))
+    best, *others = sorted(found, key=lambda one: score(*one))
+    least = _SAME * typical_error(*best, n)
+    likely = (one for one in others if _unlikelier(one, best) < _RULED_OUT)
+    return [best, *(one for one in likely if _apart(one, best, n) > least)]
 
 
 def widened(fit: Fit, assessment: Assessment, n: int, found: list[Scored]) -> Assessment:
@@ -81,11 +89,20 @@ def widened(fit: Fit, assessment: Assessment, n: int, found: list[Scored]) -> As
     if not others:
         return assessment
     for one, other in [(fit, best), *((best[0], other) for other in others)]:
-        apart = max((score(*other) - score(*best)) / _OPEN, 1.0)  # in squares of standard deviations
+        apart = max(_unlikelier(other, best), 1.0)  # in squares of standard deviations
         way = fit.spline.fit(fit.path.time[:n], deviation(one.path.R[:n], other[0].path.R[:n])).ravel()
         told = float(way @ np.linalg.lstsq(covariance, way, rcond=1e-12)[0])
         covariance = covariance + max(1 / apart - 1 / max(told, 1e-300), 0.0) * np.outer(way, way)
     return replace(assessment, covariance=covariance.reshape(assessment.covariance.shape))
+
+
+def _unlikelier(one: Scored, best: Scored) -> float:
+    """Return how much less likely a fit is than the best, in squares of standard deviations."""
+    return (score(*one) - score(*best)) / _OPEN
+
+
+def _apart(one: Scored, other: Scored, n: int) -> float:
+    return float(align(one[0].path.R[:n], other[0].path.R[:n])[0].mean())
 
 
 def score(fit: Fit, assessment: Assessment) -> float:
