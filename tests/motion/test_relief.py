@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+import trapcli
 from tests.motion.test_object_model import FINE_BAND, FRAMES, RADIUS, low_band
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline, align, deviation
@@ -121,3 +122,47 @@ def test_a_motion_that_turns_enough_is_left_and_its_errors_too() -> None:
     found = relieved(model.low, fit, assessment, FRAMES)
     assert [one for one, _ in found] == [fit]
     assert widened(fit, assessment, FRAMES, found) is assessment
+
+
+def chords(form: Array, middle: Array, R: Array, size: int, fine: int = 3) -> Array:
+    """Return the ``(size, size)`` projection of a ball of density 1 under a linear map, exact on finer pixels.
+
+    The ellipsoid is ``(x − middle)ᵀ form (x − middle) ≤ 1`` in object coordinates.
+    """
+    x = (np.arange(size * fine) + 0.5) / fine - size / 2
+    u, v = np.meshgrid(x, x)
+    here, lab = R.T @ middle, R.T @ form @ R
+    u, v = u - here[0], v - here[1]
+    half = lab[2, 0] * u + lab[2, 1] * v
+    rest = lab[0, 0] * u**2 + 2 * lab[0, 1] * u * v + lab[1, 1] * v**2 - 1
+    chord = 2 * np.sqrt(np.maximum(half**2 - lab[2, 2] * rest, 0)) / lab[2, 2]
+    return np.asarray(chord.reshape(size, fine, size, fine).mean(axis=(1, 3)))
+
+
+def shell(rng: np.random.Generator, radius: float) -> list[tuple[float, Array, Array]]:
+    """Return densities, forms and middles of the ellipsoids of a shell with five things inside."""
+    axes = np.array([1.0, 0.85, 0.7]) * radius
+    parts = [(1.0, np.diag(axes**-2.0), np.zeros(3)), (-0.7, np.diag((0.88 * axes) ** -2.0), np.zeros(3))]
+    for _ in range(5):
+        middle = rng.normal(size=3)
+        middle *= rng.uniform(0.2, 0.6) * radius / np.linalg.norm(middle)
+        own = rng.uniform(0.08, 0.22, 3) * radius
+        turn = Rotation.random(random_state=int(rng.integers(1 << 30))).as_matrix()
+        parts.append((rng.uniform(0.5, 1.5), turn @ np.diag(own**-2.0) @ turn.T, middle))
+    return parts
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_small_swings_of_a_sharp_object_are_not_told_better_than_they_are(seed: int) -> None:
+    rng, size = np.random.default_rng(seed), 48
+    R = rocking(np.deg2rad(10), 2.0, np.linspace(0, 1, 120), seed).R
+    parts = shell(rng, 0.34 * size)
+    frames = np.array([sum(d * chords(form, middle, one, size) for d, form, middle in parts) for one in R])
+    frames += 0.01 * frames.max() * rng.normal(size=frames.shape)
+    motion = trapcli.estimate(frames.astype(np.float32), attenuation=True)
+    truth = R[0].T @ R
+    if align(motion.R, R)[1]:
+        truth = np.diag([1.0, 1.0, -1.0]) @ truth @ np.diag([1.0, 1.0, -1.0])
+    error = Rotation.from_matrix(np.swapaxes(motion.R, 1, 2) @ truth).as_rotvec()
+    assert np.mean(np.abs(error[1:]) < 2 * motion.R_errors[1:]) > 0.7
