@@ -41,7 +41,7 @@ test: $(TOOLS)
 	$(BIN)/python -m pytest -m "not slow" -n 2
 
 slow: $(TOOLS)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2
 
 # damaged files until VARIANTS of each kind are tried; a failure is repeated with the SEED that is printed
 VARIANTS ?= 2000
