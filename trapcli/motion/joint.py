@@ -231,8 +231,7 @@ def _refined(
             fit, assessment = _told_anew(fit, assessment)
     if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
         model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
-        finer = model.fit(fit.path, low.time, fit.spline, smooth=not knots)
-        told = model.assess(finer)
+        finer, told = model.again(fit)
         # a prior told at low frequencies may be wrong so far beyond
         if certified(finer, told) and _as_well(finer, told, fit, assessment):
             fit, assessment = finer, told
@@ -271,20 +270,14 @@ def _told_anew(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
     Smooth objects are no samples of a field whose power has the form of that of edges: told in the whole
     band, it may leave their fine parts too little.
     """
-    again = _again(fit.model.roughly_told(fit), fit)
+    again = fit.model.roughly_told(fit).again(fit)
     return min((fit, assessment), again, key=lambda one: score(*one))
 
 
 def _placed(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
     """Fit again with an object that lies where this one was found, if it fits as well."""
-    again, told = _again(fit.model.placed(fit), fit)
+    again, told = fit.model.placed(fit).again(fit)
     return (again, told) if _as_well(again, told, fit, assessment) else (fit, assessment)
-
-
-def _again(model: ObjectModel, fit: Fit) -> tuple[Fit, Assessment]:
-    """Go on from a fit with another model of the same frames."""
-    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
-    return again, model.assess(again)
 
 
 def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:
@@ -478,8 +471,7 @@ def _with_model_error(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment
     misfit = assessment.mode_misfit
     excess = np.where(misfit > 1, misfit * _alike(fit.normal.residual), 1.0)
     model = ObjectModel.after(fit, replace(assessment, mode_misfit=excess), fit.model.band)
-    again = model.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=fit.axes)
-    honest = model.assess(again)
+    again, honest = model.again(fit)
     again = replace(again, shift=again.shift + fit.shift, cost=fit.cost, known=again.normal)
     covariance = honest.covariance
     if fit.axes == (2,):

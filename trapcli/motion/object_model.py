@@ -373,6 +373,12 @@ class ObjectModel:
         low, misfit = self.low.shifted(now.shift), self._misfit(now.solution)
         return Fit(now.path, low, now.shift, spline, misfit, roughness, axes, self, normal)
 
+    def again(self, fit: Fit, path: Path | None = None) -> tuple[Fit, Assessment]:
+        """Go on from a fit by another model of the same frames, or from another path in its stead."""
+        smooth = fit.roughness is not None
+        again = self.fit(path or fit.path, self.low.time, fit.spline, smooth=smooth, axes=fit.axes)
+        return again, self.assess(again)
+
     def _degrees(self, groups: int) -> float:
         """Return roughly the misfit to be expected of the right motion."""
         return max(self.data_count - len(self.position) - 2 * groups, 0.1 * self.data_count)
@@ -712,9 +718,7 @@ def refitted(low: LowBand, fit: Fit, path: Path, looseness: float = np.inf) -> t
         Of the prior.
     """
     model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(low.time) :], looseness)
-    smooth = fit.roughness is not None
-    again = model.fit(path, low.time, fit.spline, smooth=smooth, axes=fit.axes)
-    return again, model.assess(again)
+    return model.again(fit, path)
 
 
 @dataclass(frozen=True)

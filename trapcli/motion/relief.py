@@ -48,7 +48,7 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment, n: int) -> list[Sco
         How many of the path's times are those of frames.
     """
     views_apart = tilt(fit.path.R)
-    alike = views_apart <= _WIDE[1] and next(_alike(fit), None) is not None
+    alike = views_apart <= _WIDE[1] and next(_other_tilts(fit), None) is not None
     if not alike and views_apart > _WIDE[0]:
         return [(fit, assessment)]
     found = [(fit, assessment), refitted(low, fit, fit.path, LOOSE)]
@@ -56,7 +56,7 @@ def relieved(low: LowBand, fit: Fit, assessment: Assessment, n: int) -> list[Sco
         return [min(found, key=lambda one: score(*one))]
     for _ in range(_MOST):
         best = min(found, key=lambda one: score(*one))
-        for path in _alike(best[0]):
+        for path in _other_tilts(best[0]):
             found.append(refitted(low, best[0], path, LOOSE))
             if score(*found[-1]) < score(*best) - _BETTER:
                 break
@@ -127,7 +127,7 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
     return Path(time, R, path.omega[first]).near(spline, path.time)
 
 
-def _alike(fit: Fit) -> Iterator[Path]:
+def _other_tilts(fit: Fit) -> Iterator[Path]:
     """Yield the path of a fit with other tilts that explain the frames nearly as well, before any fit."""
     for factor in _FACTORS:
         path = tilted(fit.path, factor, fit.spline)
