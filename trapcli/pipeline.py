@@ -3,7 +3,7 @@
 ::
 
     frames ──▶ attenuation ──▶ centres ──▶ reduced map ──▶ v, ω₃ ──▶ α ──▶ R ──▶ Motion
-               to_attenuation  └─────── estimate_paper or estimate_joint ───────┘
+               to_attenuation  └───────── estimate_paper or find_motion ────────┘
                      ▲                                                   │
                      └──────────── dust: find_standing_pattern ◀─────────┘
 
@@ -15,19 +15,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from trapcli.config import GUESSED_BACKGROUNDS, EstimateConfig, to_toml
+from trapcli.config import GUESSED_BACKGROUNDS, EstimateConfig, MotionConfig, to_toml
 from trapcli.errors import ConfigError, InputError
 from trapcli.preprocess.attenuation import Projections, to_attenuation
 from trapcli.result import provenance
 from trapcli.result.motion import Flag, Motion
 from trapcli.stack.frames import Frames
 from trapcli.stack.source import calibrated
+
+if TYPE_CHECKING:  # each method is imported only when it is used
+    from trapcli.motion.joint import Found
 
 Progress = Callable[[str, int, int], None]
 
@@ -98,13 +101,9 @@ def estimate(
     # the matrices are small and many: threads that share one spend most of their time waiting for each other
     with threadpool_limits(1, user_api="blas"):
         projections = to_attenuation(frames, config.preprocess, roi=config.input.roi)
-        told = partial(
-            recover, config=config.motion, time=frames.index * step, pixel_size=pixel, progress=progress
-        )
-        motion = told(projections)
         guessed = not config.preprocess.attenuation and config.preprocess.background in GUESSED_BACKGROUNDS
-        if guessed and config.motion.method == "auto":
-            projections, motion = _without_dust(projections, motion, told, pixel)
+        about = {"time": frames.index * step, "pixel_size": pixel, "progress": progress}
+        projections, motion = recover(projections, config.motion, guessed, **about)
         if isinstance(projections, Projections):
             left_out = projections.left_out
             flags = np.where(left_out > 0, motion.flags & ~np.uint16(Flag.BLANK) | left_out, motion.flags)
@@ -121,33 +120,48 @@ def _given(table: Any, **values: Any) -> Any:
     return replace(table, **{name: value for name, value in values.items() if value is not None})
 
 
-def _method(name: str) -> Callable[..., Motion]:
-    """Return the function for a method; each is imported only when it is used."""
+def _method(name: str) -> Callable[..., tuple[Frames, Motion]]:
+    """Return what recovers the motion from projections, and returns them as it took them."""
     if name == "paper":
-        from trapcli.motion.paper import estimate_paper
-
-        return estimate_paper
+        return _paper
     if name == "auto":
-        from trapcli.motion.joint import estimate_joint
-
-        return estimate_joint
+        return _joint
     raise ConfigError(f"--method {name}: must be auto or paper")
 
 
+def _paper(projections: Frames, config: MotionConfig, guessed: bool, **about: Any) -> tuple[Frames, Motion]:
+    from trapcli.motion.paper import estimate_paper
+
+    return projections, estimate_paper(projections, config, **about)
+
+
+def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: Any) -> tuple[Frames, Motion]:
+    from trapcli.motion.joint import find_motion
+
+    find = partial(find_motion, config=config, **about)
+    found = find(projections)
+    if guessed:
+        projections, found = _without_dust(projections, found, find, about["pixel_size"])
+    return projections, found.refined().motion()
+
+
 def _without_dust(
-    projections: Frames, motion: Motion, recover: Callable[[Frames], Motion], pixel_size: float
-) -> tuple[Frames, Motion]:
+    projections: Frames, found: Found, find: Callable[[Frames], Found], pixel_size: float
+) -> tuple[Frames, Found]:
     """Take off what stays in place under the particle, if that explains the images better."""
     from trapcli.preprocess.standing import find_standing_pattern, without
 
+    motion = found.motion()
     pattern = find_standing_pattern(projections, motion, pixel_size)
     if pattern is None:
-        return projections, motion
+        return projections, found
     cleared = without(projections, pattern)
-    again = recover(cleared)
+    found_again = find(cleared)
+    again = found_again.motion()
     both = np.isfinite(motion.residual) & np.isfinite(again.residual)
     better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False
-    return (cleared, again) if better and again.identifiable >= motion.identifiable else (projections, motion)
+    better = better and again.identifiable >= motion.identifiable
+    return (cleared, found_again) if better else (projections, found)
 
 
 def _from_array(frames: Any) -> Frames:

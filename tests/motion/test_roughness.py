@@ -78,9 +78,9 @@ def test_kicks_are_told_from_a_motion_that_is_smooth() -> None:
     for seed in range(10):
         kicks = ERROR * np.random.default_rng(100 + seed).normal(size=(200, 3))
         angles = 0.1 * uneven(time) + np.cumsum(kicks, axis=0)
-        assert Roughness(SPLINE).kicked(*measured(0.1 * uneven(time), seed), still(), 0).kicks == 0
+        assert Roughness(SPLINE).formed(*measured(0.1 * uneven(time), seed), still(), 0).kicks == 0
         change = *measured(angles, seed), still(), 0
-        found = Roughness(SPLINE).kicked(*change)
+        found = Roughness(SPLINE).formed(*change)
         assert found.kicks > 0
         for roughness, errors in ((Roughness(SPLINE), smooth_error), (found, kicked_error)):
             hessian = change[0] + roughness.weighed(*change).curvature(still(), 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -86,6 +87,7 @@ def test_a_pattern_counts_only_where_it_explains_the_images(
     first, second = (
         replace(truth, residual=np.full(len(truth), one)) for one in (2.0, 1.0 if better else 3.0)
     )
-    taken, motion = pipeline._without_dust(frames, first, lambda _: second, PIXEL)
-    assert motion is (second if better else first)
+    found, again = (SimpleNamespace(motion=lambda one=one: one) for one in (first, second))
+    taken, chosen = pipeline._without_dust(frames, found, lambda _: again, PIXEL)
+    assert chosen is (again if better else found)
     assert bool(taken.info.warnings) == better

@@ -8,7 +8,7 @@ per degree of freedom, is 1 where pixel noise explains it: the certificate of th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,15 +84,59 @@ _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is comm
 _SIGNIFICANT = 5.0  # standard deviations of change that show that anything moves
 
 
-def estimate_joint(
+@dataclass(frozen=True)
+class Found:
+    """The motion that explains the frames best, of all hypotheses, before it is refined.
+
+    Attributes
+    ----------
+    stack:
+        What is known of the frames.
+    low:
+        Means over groups of frames to which the motion is fitted.
+    best:
+        The motion and what is known of it; None where nothing changes.
+    bands:
+        Of the object model that found it and of the finest one that is worthwhile [rad / length].
+    knots:
+        Intervals of ω's spline, 0 where the data tell them.
+    """
+
+    stack: Stack
+    low: LowBand
+    best: tuple[Fit, Assessment] | None
+    bands: tuple[float, float]
+    knots: int
+
+    def motion(self) -> Motion:
+        """Return the motion as it is."""
+        if self.best is None:
+            return nothing_known(
+                self.stack,
+                "nothing changes between the frames beyond the noise: the object is still, "
+                "or turns about an axis of symmetry; no rotation can be told",
+            )
+        verdict = judge(*self.best)
+        unseen = unseen_turn(*self.best, self.bands[0]) if verdict.identifiable else None
+        return to_motion(self.stack, *self.best, verdict, unseen)
+
+    def refined(self) -> Found:
+        """Return the motion with another tilt where that is likelier, all knots that it needs, and sharp edges."""
+        if self.best is None:
+            return self
+        time, finest = self.stack.low.time, self.bands[1]
+        return replace(self, best=_refined(self.low, *self.best, time, finest, self.knots))
+
+
+def find_motion(
     attenuation: Frames,
     config: MotionConfig,
     *,
     time: Array,
     pixel_size: float = 1.0,
     progress: Progress | None = None,
-) -> Motion:
-    """Recover the motion from all frames at once, with errors and a verdict.
+) -> Found:
+    """Find the motion from all frames at once.
 
     Parameters
     ----------
@@ -109,7 +153,7 @@ def estimate_joint(
 
     Returns
     -------
-    Motion
+    Found
         In the units of `time` and `pixel_size`, which the caller names.
 
     Raises
@@ -137,20 +181,28 @@ def estimate_joint(
     stack = Stack(reduced, low, centers, seen, outlying, attenuation.index)
     used = np.flatnonzero(seen & ~outlying)
     pace = _turn_per_frame(reduced.samples[used], reduced.noise)
-    if pace == 0.0:
-        return nothing_known(
-            stack,
-            "nothing changes between the frames beyond the noise: the object is still, "
-            "or turns about an axis of symmetry; no rotation can be told",
-        )
     bands = (config.band, config.band) if config.band else _bands(low.select(used))
+    if pace == 0.0:
+        return Found(stack, low, None, bands, config.knots)
     fit, assessment = _best_motion(stack, used, pace, bands[0], config.knots, progress)
     stack, fit, assessment = _quieter(stack, used, pace, fit, assessment)
-    low = _fine_groups(stack, used, pace)
-    fit, assessment = _refined(low, fit, assessment, time, bands[1], config.knots)
-    verdict = judge(fit, assessment)
-    unseen = unseen_turn(fit, assessment, bands[0]) if verdict.identifiable else None
-    return to_motion(stack, fit, assessment, verdict, unseen)
+    return Found(stack, _fine_groups(stack, used, pace), (fit, assessment), bands, config.knots)
+
+
+def estimate_joint(
+    attenuation: Frames,
+    config: MotionConfig,
+    *,
+    time: Array,
+    pixel_size: float = 1.0,
+    progress: Progress | None = None,
+) -> Motion:
+    """Recover the motion from all frames at once, with errors and a verdict.
+
+    Parameters and what is raised are those of `find_motion`.
+    """
+    found = find_motion(attenuation, config, time=time, pixel_size=pixel_size, progress=progress)
+    return found.refined().motion()
 
 
 def _bands(low: LowBand) -> tuple[float, float]:
@@ -222,22 +274,23 @@ def _refined(
     turns_in_plane = fit.axes == (2,)  # what there is besides, a richer motion has told
     hopeless = fit.cost > _HOPELESS * assessment.degrees
     found = [(fit, assessment)]
+    model = fit.model
     if not (turns_in_plane or hopeless):
         found = relieved(low, fit, assessment, len(time))
         fit, assessment = found[0]
         if not knots:
             fit, assessment = _uncrowded(fit, assessment, time)
-        if len(found) == 1:
-            fit, assessment = _told_anew(fit, assessment)
-    if finest > fit.model.band and not turns_in_plane and certified(fit, assessment):
-        model = ObjectModel(low, finest, guard=fit.model.guard, prior=fit.model.prior)
-        finer, told = model.again(fit)
+        # a depth that the frames leave open would confirm itself
+        model = _told(fit) if len(found) == 1 else fit.model
+    bands = [finest] if finest > fit.model.band and not turns_in_plane and certified(fit, assessment) else []
+    if model is not fit.model:
+        bands.append(fit.model.band)
+    for band in bands:
         # a prior told at low frequencies may be wrong so far beyond
-        if certified(finer, told) and _as_well(finer, told, fit, assessment):
-            fit, assessment = finer, told
-    # a depth that the frames leave open would confirm itself
-    if len(found) == 1 and not (turns_in_plane or hopeless):
-        fit, assessment = _placed(fit, assessment)
+        again, known = ObjectModel(low, band, guard=model.guard, prior=model.prior).again(fit)
+        if _as_well(again, known, fit, assessment):
+            fit, assessment = again, known
+            break
     if not certified(fit, assessment):
         fit, assessment = _with_model_error(fit, assessment)
     return fit, widened(fit, assessment, len(time), found)
@@ -264,20 +317,14 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
         fit, assessment = richer, told
 
 
-def _told_anew(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
-    """Fit again with a prior that low frequencies alone tell, if that explains the images better.
+def _told(fit: Fit) -> ObjectModel:
+    """Return the model that the evidence at a motion tells: how large and strong blobs are, and where they lie.
 
     Smooth objects are no samples of a field whose power has the form of that of edges: told in the whole
-    band, it may leave their fine parts too little.
+    band, it may leave their fine parts too little. So low frequencies alone may tell it.
     """
-    again = fit.model.roughly_told(fit).again(fit)
-    return min((fit, assessment), again, key=lambda one: score(*one))
-
-
-def _placed(fit: Fit, assessment: Assessment) -> tuple[Fit, Assessment]:
-    """Fit again with an object that lies where this one was found, if it fits as well."""
-    again, told = fit.model.placed(fit).again(fit)
-    return (again, told) if _as_well(again, told, fit, assessment) else (fit, assessment)
+    models = fit.model, fit.model.roughly_told(fit)
+    return min(models, key=lambda model: model.score(fit)).placed(fit)
 
 
 def _as_well(finer: Fit, told: Assessment, fit: Fit, assessment: Assessment) -> bool:

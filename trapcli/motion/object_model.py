@@ -288,6 +288,11 @@ class ObjectModel:
             prior = prior.placed(self.low, self.position, amplitude**2, views.spread)
         return self._with(replace(prior, power=LOOSE * prior.power))
 
+    def score(self, fit: Fit) -> float:
+        """Return the misfit of this model at a fit's motion less what is expected, but for what all share."""
+        views = self.views(fit.R)
+        return self._misfit(self._solved(views, fit.low.modes)) + views.seen
+
     def _with(self, prior: Prior) -> ObjectModel:
         return ObjectModel(self.low, self.band, guard=self.guard, prior=prior, variance=self.variance)
 
@@ -353,7 +358,7 @@ class ObjectModel:
                 change = hessian / excess, downhill / excess, now.path, groups
                 if roughness is None:
                     first = Roughness(spline, axes)
-                    roughness = first.kicked(*change) if excess < _NEAR else first
+                    roughness = first.formed(*change) if excess < _NEAR else first
                 roughness = roughness.weighed(*change)
                 roughness = replace(roughness, weight=excess * roughness.weight)
                 hessian += roughness.curvature(now.path, groups)

@@ -133,5 +133,8 @@ def radial_density(low: LowBand, distance: Array) -> Array:
 
 def _near(position: Array, place: Array, length: float) -> Array:
     """Return ``(n, L)`` weights of places about positions, Gaussian of a standard deviation, of sum 1."""
-    weight = np.exp(-0.5 * (cdist(position, place) / length) ** 2)
-    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
+    weight = cdist(position, place, "sqeuclidean")
+    weight *= -0.5 / length**2
+    np.exp(weight, out=weight)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.asarray(weight)

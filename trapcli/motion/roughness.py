@@ -1,11 +1,15 @@
 """How fast ω(t) may change, found from the data: a penalty on its roughness, chosen by its evidence.
 
-The second differences of ω on a fine grid are taken to be Gaussian with a covariance of their own, as in a
-smoothing spline: a particle may turn unevenly about one axis and steadily about the others. The covariance is
-the one under which the data are likeliest, the motion integrated out in the quadratic approximation of the
-misfit: one search finds its size, expectation and maximization its shape (Dempster, Laird and Rubin 1977,
+Where the motion is bent by cubic splines, ω is nearly a quadratic one. Differences of its coefficients, second
+ones or higher, are taken to be Gaussian (Eilers and Marx 1996, DOI 10.1214/ss/1038425655) with a covariance of
+their own: a particle may turn unevenly about one axis and steadily about the others. The covariance is the one
+under which the data are likeliest, the motion integrated out in the quadratic approximation of the misfit: one
+search finds its size, expectation and maximization its shape (Dempster, Laird and Rubin 1977,
 DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have smoothed away (Wahba 1983,
 DOI 10.1111/j.2517-6161.1983.tb01239.x).
+
+Of which order the differences are is told by the evidence as well: the smoother ω is, the more of its wiggles
+are noise, and the fewer numbers describe it.
 
 Thermal motion kicks a particle anew all the time: R goes on a random walk, and ω is white. Second differences
 of white noise are correlated as the squares of the second difference are; how much of that there is, is told
@@ -14,13 +18,15 @@ by the evidence too.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 from scipy.optimize import minimize_scalar
 
 from trapcli.motion.path import Path, Spline, cross_matrix
@@ -29,15 +35,15 @@ Array = NDArray[np.float64]
 
 _RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
 _ROUNDS = 6  # of expectation and maximization, each time that the weight is told
-_ALIKE = 1.0  # second differences that are taken as seen beforehand, alike in all directions
+_ALIKE = 1.0  # differences that are taken as seen beforehand, alike in all directions
 _KICKS = 1e1, 1e3, 1e5, 1e7  # that are tried, one after the other until the data get less likely
 _SURE = 6.0  # change of minus twice a log-likelihood that counts
-_FREE = 3  # for each axis: a constant rotation and an ω that is linear in time cost nothing
+_ORDERS = 2, 3, 4  # of the differences that are tried, in the same way
 
 
 @dataclass(frozen=True)
 class Roughness:
-    """``weight · dᵀ shape d``, summed over the second differences d of ω on the grid of a spline.
+    """``weight · dᵀ shape d``, summed over the differences d of the coefficients of ω.
 
     Paths hold the grid, followed by a number of other times, `after`.
 
@@ -47,17 +53,20 @@ class Roughness:
         What bends the path.
     axes:
         Lab axes about which the path is bent, A out of 0, 1, 2; P coefficients in all.
+    order:
+        Of the differences.
     weight:
-        In units of the misfit for second differences [rad].
+        In units of the misfit for differences [rad].
     shape:
-        ``(A, A)`` inverse of the covariance of second differences, with a determinant of 1; None for a
-        covariance that is alike in all directions.
+        ``(A, A)`` inverse of the covariance of differences, with a determinant of 1; None for a covariance
+        that is alike in all directions.
     kicks:
         Variance of what is white in ω, in units of that of second differences.
     """
 
     spline: Spline
     axes: tuple[int, ...] = (0, 1, 2)
+    order: int = _ORDERS[0]
     weight: float = 0.0
     shape: Array | None = None
     kicks: float = 0.0
@@ -76,24 +85,32 @@ class Roughness:
         design = self._weighted(self._design(path, after))
         return np.asarray(self.weight * design.T @ design)
 
-    def kicked(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
-        """Return the roughness with as many kicks as make the data likeliest; arguments as of `weighed`."""
+    def formed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
+        """Return the roughness of the order, and with the kicks, that make the data likeliest.
 
-        def tried(kicks: float) -> tuple[Roughness, float]:
-            one = replace(self, kicks=kicks)
+        Arguments are those of `weighed`. A motion that is smooth to a higher order isn't kicked.
+        """
+
+        def surprise(one: Roughness) -> float:
             design = one._design(path, after)
-            found, surprise = one._alike(hessian, downhill, design, one._bend(path, after))
-            free = len(self.axes) * self._rank(hessian) * np.log(found.weight)
-            return one, float(surprise + free - found._volume(design))
+            found, least = one._alike(hessian, downhill, design, one._bend(path, after))
+            free = len(self.axes) * one._rank(hessian) * np.log(found.weight)
+            return float(least + free - found._volume(design))
 
-        best, least = tried(0.0)
-        for kicks in _KICKS:
-            one, surprise = tried(kicks)
-            if surprise > least + _SURE:
-                break
-            if surprise < least - _SURE:
-                best, least = one, surprise
-        return best
+        def likelier(forms: Iterable[Roughness], best: Roughness, least: float) -> tuple[Roughness, float]:
+            for one in forms:
+                tried = surprise(one)
+                if tried > least + _SURE:
+                    break
+                if tried < least - _SURE:
+                    best, least = one, tried
+            return best, least
+
+        smoother = (replace(self, order=order) for order in _ORDERS[1:])
+        best, least = likelier(smoother, self, surprise(self))
+        if best.order > self.order:
+            return best
+        return likelier((replace(self, kicks=kicks) for kicks in _KICKS), self, least)[0]
 
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
         """Return the roughness with the weight and shape under which the data are likeliest.
@@ -134,7 +151,7 @@ class Roughness:
         return replace(alike, weight=unit * 10.0 ** float(best.x)), float(best.fun)
 
     def _likelier(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
-        """Return the roughness with the covariance that second differences are expected to have."""
+        """Return the roughness with the covariance that differences are expected to have."""
         design, bend = self._weighted(design), self._weighted(bend)
         factor = scipy.linalg.cholesky(
             hessian + self.weight * design.T @ design, lower=True, check_finite=False
@@ -153,15 +170,17 @@ class Roughness:
 
     def _volume(self, design: Array) -> float:
         """Return the logarithm of the determinant of the curvature; a turn of 1 rad counts 1 as well."""
-        design = self._weighted(design)
-        curvature = np.asarray(self.weight * design.T @ design)
-        curvature[np.diag_indices_from(curvature)] += 1.0
-        factor = scipy.linalg.cholesky(curvature, lower=True, check_finite=False)
-        return 2 * float(np.log(np.diag(factor)).sum())
+        design = np.sqrt(self.weight) * self._weighted(design)
+        # not by the curvature, of which rounding would leave little where ω is smooth
+        factor = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]), mode="r")
+        return 2 * float(np.log(np.abs(np.diag(factor))).sum())
 
     def _rank(self, hessian: Array) -> float:
-        """Return how many second differences of each component the P coefficients decide."""
-        return max(len(hessian) / len(self.axes) - _FREE, 1.0)
+        """Return how many differences of each component the P coefficients decide.
+
+        A constant rotation, and an ω whose differences vanish, cost nothing.
+        """
+        return max(len(hessian) / len(self.axes) - self.order - 1, 1.0)
 
     @property
     def _root(self) -> Array:
@@ -175,11 +194,11 @@ class Roughness:
         return np.asarray(alike.reshape(-1, *differences.shape[2:]))
 
     def _bend(self, path: Path, after: int) -> Array:
-        """Return the ``(T, A)`` second differences of ω along the axes."""
+        """Return the ``(T, A)`` differences of ω along the axes."""
         return np.asarray(self._difference @ self._omega(path, after)[:, list(self.axes)])
 
     def _design(self, path: Path, after: int) -> Array:
-        """Return ``(T, A, P)`` derivatives of the second differences by the spline's coefficients."""
+        """Return ``(T, A, P)`` derivatives of the differences by the spline's coefficients."""
         grid, omega, axes = self.spline.grid, self._omega(path, after), list(self.axes)
         change = np.einsum("mb,ij->mibj", self.spline.slopes(grid), np.eye(3))
         # δω = δ' + ω × δ
@@ -187,17 +206,26 @@ class Roughness:
         rough = np.tensordot(self._difference, change[:, axes][..., axes], (1, 0))
         return np.asarray(rough.reshape(*rough.shape[:2], -1))
 
-    @cached_property
+    @property
     def _difference(self) -> Array:
-        """Return the matrix that takes second differences on the grid, and makes them independent."""
         grid = self.spline.grid
-        second = np.diff(np.eye(len(grid)), 2, axis=0)
-        if self.kicks:
-            covariance = np.eye(len(second)) + self.kicks * second @ second.T
-            factor = scipy.linalg.cholesky(covariance, lower=True)
-            second = scipy.linalg.solve_triangular(factor, second, lower=True)
-        return np.asarray((grid[1] - grid[0]) * second)
+        return (grid[1] - grid[0]) * _differences(self.spline.intervals, self.order, self.kicks)
 
     def _omega(self, path: Path, after: int) -> Array:
         last = len(path.time) - after
         return path.omega[last - len(self.spline.grid) : last]
+
+
+@lru_cache(maxsize=8)
+def _differences(intervals: int, order: int, kicks: float) -> Array:
+    """Return the matrix that takes what is on a spline's grid to differences, and makes these independent."""
+    grid = np.arange(2 * intervals + 1) / 2
+    knots = np.arange(-2.0, intervals + 3.0)
+    basis = BSpline.design_matrix(np.minimum(grid, intervals * (1 - 1e-12)), knots, 2).toarray()
+    difference = np.diff(np.eye(intervals + 2), order, axis=0)
+    independent = difference @ np.linalg.pinv(basis)
+    if kicks:
+        covariance = np.eye(len(difference)) + kicks * difference @ difference.T
+        factor = scipy.linalg.cholesky(covariance, lower=True)
+        independent = scipy.linalg.solve_triangular(factor, independent, lower=True)
+    return np.asarray(independent)
