@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -138,7 +137,9 @@ def _paper(projections: Frames, config: MotionConfig, guessed: bool, **about: An
 def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: Any) -> tuple[Frames, Motion]:
     from trapcli.motion.joint import find_motion
 
-    find = partial(find_motion, config=config, **about)
+    def find(projections: Frames) -> Found:
+        return find_motion(projections, config, **about)
+
     found = find(projections)
     if guessed:
         projections, found = _without_dust(projections, found, find, about["pixel_size"])

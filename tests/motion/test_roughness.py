@@ -14,15 +14,15 @@ SPLINE = Spline(0.0, 1.0, 40)
 ERROR = 1e-3  # of the angles at each time [rad]
 
 
-def still() -> Path:
-    grid = SPLINE.grid
+def still(spline: Spline = SPLINE) -> Path:
+    grid = spline.grid
     return Path(grid, np.tile(np.eye(3), (len(grid), 1, 1)), np.zeros((len(grid), 3)))
 
 
-def measured(angles: Array, seed: int) -> tuple[Array, Array]:
+def measured(angles: Array, seed: int, spline: Spline = SPLINE) -> tuple[Array, Array]:
     """Return Hessian and gradient of the misfit to noisy small ``(N, 3)`` angles."""
     noisy = angles + ERROR * np.random.default_rng(seed).normal(size=angles.shape)
-    values = SPLINE.values(np.linspace(0, 1, len(angles)))
+    values = spline.values(np.linspace(0, 1, len(angles)))
     return np.kron(values.T @ values, np.eye(3)) / ERROR**2, (values.T @ noisy).ravel() / ERROR**2
 
 
@@ -88,6 +88,25 @@ def test_kicks_are_told_from_a_motion_that_is_smooth() -> None:
             errors.append(np.mean((values @ step - angles) ** 2))
     assert (np.array(kicked_error) < np.array(smooth_error)).all()
     assert np.mean(kicked_error) < 0.95 * np.mean(smooth_error)
+
+
+@pytest.mark.parametrize("intervals", [40, 80])
+def test_the_smoother_the_motion_the_higher_the_order_and_the_less_it_errs(intervals: int) -> None:
+    time, spline = np.linspace(0, 1, 200), Spline(0.0, 1.0, intervals)
+    values, path = spline.values(time), still(spline)
+    errors = []
+    for seed in range(10):
+        change = *measured(uneven(time), seed, spline), path, 0
+        found = Roughness(spline).formed(*change)
+        assert found.order > Roughness(spline).order
+        for roughness in (Roughness(spline), found):
+            step = np.linalg.solve(change[0] + roughness.weighed(*change).curvature(path, 0), change[1])
+            errors.append(np.mean((values @ step.reshape(-1, 3) - uneven(time)) ** 2))
+    plain, formed = np.reshape(errors, (-1, 2)).mean(axis=0)
+    assert formed < 0.9 * plain
+    # an angular velocity that jumps is not smooth to any order
+    angles = np.abs(time - 0.43)[:, None] * [0.5, -0.3, 0.4]
+    assert Roughness(spline).formed(*measured(angles, 0, spline), path, 0).order == Roughness(spline).order
 
 
 @pytest.mark.parametrize("kicks", [0.0, 100.0])

@@ -121,7 +121,7 @@ class Found:
         return to_motion(self.stack, *self.best, verdict, unseen)
 
     def refined(self) -> Found:
-        """Return the motion with another tilt where that is likelier, all knots that it needs, and sharp edges."""
+        """Return the likeliest motion near this one, with an object that has its sharp edges."""
         if self.best is None:
             return self
         time, finest = self.stack.low.time, self.bands[1]
@@ -318,7 +318,7 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
 
 
 def _told(fit: Fit) -> ObjectModel:
-    """Return the model that the evidence at a motion tells: how large and strong blobs are, and where they lie.
+    """Return the model that the evidence at a motion tells: how large blobs are, how strong, and where.
 
     Smooth objects are no samples of a field whose power has the form of that of edges: told in the whole
     band, it may leave their fine parts too little. So low frequencies alone may tell it.

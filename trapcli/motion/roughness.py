@@ -1,12 +1,12 @@
 """How fast ω(t) may change, found from the data: a penalty on its roughness, chosen by its evidence.
 
-Where the motion is bent by cubic splines, ω is nearly a quadratic one. Differences of its coefficients, second
-ones or higher, are taken to be Gaussian (Eilers and Marx 1996, DOI 10.1214/ss/1038425655) with a covariance of
-their own: a particle may turn unevenly about one axis and steadily about the others. The covariance is the one
-under which the data are likeliest, the motion integrated out in the quadratic approximation of the misfit: one
-search finds its size, expectation and maximization its shape (Dempster, Laird and Rubin 1977,
-DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have smoothed away (Wahba 1983,
-DOI 10.1111/j.2517-6161.1983.tb01239.x).
+Where the motion is bent by cubic splines, ω is nearly a quadratic one. Differences of its coefficients,
+second ones or higher, are taken to be Gaussian (Eilers and Marx 1996, DOI 10.1214/ss/1038425655) with a
+covariance of their own: a particle may turn unevenly about one axis and steadily about the others. The
+covariance is the one under which the data are likeliest, the motion integrated out in the quadratic
+approximation of the misfit: one search finds its size, expectation and maximization its shape (Dempster,
+Laird and Rubin 1977, DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have
+smoothed away (Wahba 1983, DOI 10.1111/j.2517-6161.1983.tb01239.x).
 
 Of which order the differences are is told by the evidence as well: the smoother ω is, the more of its wiggles
 are noise, and the fewer numbers describe it.
@@ -209,7 +209,7 @@ class Roughness:
     @property
     def _difference(self) -> Array:
         grid = self.spline.grid
-        return (grid[1] - grid[0]) * _differences(self.spline.intervals, self.order, self.kicks)
+        return np.asarray((grid[1] - grid[0]) * _differences(self.spline.intervals, self.order, self.kicks))
 
     def _omega(self, path: Path, after: int) -> Array:
         last = len(path.time) - after
