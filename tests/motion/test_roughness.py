@@ -48,7 +48,7 @@ def test_a_shape_errs_less_about_the_axes_that_are_steady() -> None:
         free = Roughness(SPLINE)
         design, bend = free._design(still(), 0), free._bend(still(), 0)
         for roughness in (
-            free._alike(hessian, downhill, design, bend)[0],
+            free._alike(hessian, downhill, design, bend),
             free.weighed(hessian, downhill, still(), 0),
         ):
             step = np.linalg.solve(hessian + roughness.curvature(still(), 0), downhill)

@@ -332,6 +332,7 @@ class ObjectModel:
         """
         groups = len(times)
         values = spline.values(times)
+        told, formed = Roughness(spline, axes), False
         roughness: Roughness | None = None
         bent = _coefficients(spline, axes)
         now = self._tried(path, np.zeros((groups, 2)))
@@ -356,11 +357,10 @@ class ObjectModel:
                 # far from the motion the misfit is large, and must not call for wiggles
                 excess = max(1.0, state.cost / self._degrees(groups))
                 change = hessian / excess, downhill / excess, now.path, groups
-                if roughness is None:
-                    first = Roughness(spline, axes)
-                    roughness = first.formed(*change) if excess < _NEAR else first
-                roughness = roughness.weighed(*change)
-                roughness = replace(roughness, weight=excess * roughness.weight)
+                if excess < _NEAR and not formed:
+                    told, formed = Roughness(spline, axes).formed(*change), True
+                told = told.weighed(*change)
+                roughness = replace(told, weight=excess * told.weight)
                 hessian += roughness.curvature(now.path, groups)
                 downhill -= roughness.uphill(now.path, groups)
             step = np.zeros((spline.size, 3))

@@ -34,7 +34,9 @@ from trapcli.motion.path import Path, Spline, cross_matrix
 Array = NDArray[np.float64]
 
 _RANGE = (-8.0, 8.0)  # decades of the weight about the one that is as stiff as the misfit
-_ROUNDS = 6  # of expectation and maximization, each time that the weight is told
+_LOOSER = 1.0, 1e-3  # shares of the weight that suits all directions alike, from which shapes are sought
+_ROUNDS, _MORE_ROUNDS = 20, 6  # of expectation and maximization, at first and each time that the motion moved
+_UNIFORM = 1.0  # differences of each axis fewer, as each standard deviation of theirs is as likely beforehand
 _ALIKE = 1.0  # differences that are taken as seen beforehand, alike in all directions
 _KICKS = 1e1, 1e3, 1e5, 1e7  # that are tried, one after the other until the data get less likely
 _SURE = 6.0  # change of minus twice a log-likelihood that counts
@@ -92,10 +94,8 @@ class Roughness:
         """
 
         def surprise(one: Roughness) -> float:
-            design = one._design(path, after)
-            found, least = one._alike(hessian, downhill, design, one._bend(path, after))
-            free = len(self.axes) * one._rank(hessian) * np.log(found.weight)
-            return float(least + free - found._volume(design))
+            design, bend = one._design(path, after), one._bend(path, after)
+            return one._alike(hessian, downhill, design, bend)._surprise(hessian, downhill, design, bend)
 
         def likelier(forms: Iterable[Roughness], best: Roughness, least: float) -> tuple[Roughness, float]:
             for one in forms:
@@ -115,40 +115,56 @@ class Roughness:
     def weighed(self, hessian: Array, downhill: Array, path: Path, after: int) -> Roughness:
         """Return the roughness with the weight and shape under which the data are likeliest.
 
+        The search goes on from the shape that there is.
+
         Parameters
         ----------
         hessian, downhill:
             ``(P, P)``, positive definite, and ``(P,)``: bending by x changes the misfit,
             minus twice a log-likelihood, by ``xᵀ hessian x − 2 downhill · x``.
         """
-        design, bend = self._design(path, after), self._bend(path, after)
-        roughness, _ = self._alike(hessian, downhill, design, bend)
-        for _ in range(_ROUNDS if len(self.axes) > 1 else 0):
-            roughness = roughness._likelier(hessian, downhill, design, bend)
-        return roughness
+        told = hessian, downhill, self._design(path, after), self._bend(path, after)
+        if self.shape is not None:
+            return self._shaped(_MORE_ROUNDS, *told)
+        alike = self._alike(*told)
+        if len(self.axes) == 1:
+            return alike
+        # stiff in all directions, or loose: the way from one to the other is long
+        starts = (replace(alike, weight=share * alike.weight) for share in _LOOSER)
+        found = (start._shaped(_ROUNDS, *told) for start in starts)
+        stiff = _UNIFORM * len(self.axes)
+        return min(found, key=lambda one: one._surprise(*told) + stiff * np.log(one.weight))
 
-    def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> tuple[Roughness, float]:
-        """Return the roughness that is alike in all directions, with the likeliest weight.
-
-        With minus twice the logarithm of the evidence for that weight.
-        """
+    def _alike(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
+        """Return the roughness that is alike in all directions, with the likeliest weight."""
         alike = replace(self, shape=None)
         design, bend = alike._weighted(design), alike._weighted(bend)
         curvature, pull, square = design.T @ design, design.T @ bend, float(bend @ bend)
-        rank = len(self.axes) * self._rank(hessian)
+        told = len(self.axes) * (self._rank(hessian) - _UNIFORM)
         unit = float(np.trace(hessian) / np.trace(curvature))
 
         def surprise(decade: float) -> float:
             weight = unit * 10.0**decade
-            factor = scipy.linalg.cholesky(hessian + weight * curvature, lower=True, check_finite=False)
-            gained = scipy.linalg.solve_triangular(
-                factor, downhill - weight * pull, lower=True, check_finite=False
-            )
-            volume = 2 * float(np.log(np.diag(factor)).sum())
-            return float(weight * square - gained @ gained + volume - rank * np.log(weight))
+            rest = _unexplained(hessian + weight * curvature, downhill - weight * pull)
+            return float(weight * square + rest - told * np.log(weight))
 
         best: Any = minimize_scalar(surprise, bounds=_RANGE, method="bounded", options={"xatol": 0.05})
-        return replace(alike, weight=unit * 10.0 ** float(best.x)), float(best.fun)
+        return replace(alike, weight=unit * 10.0 ** float(best.x))
+
+    def _surprise(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> float:
+        """Return minus twice the logarithm of the evidence, but for what does not depend on roughness."""
+        volume = self._volume(design)
+        root = np.sqrt(self.weight)
+        design, bend = root * self._weighted(design), root * self._weighted(bend)
+        rest = _unexplained(hessian + design.T @ design, downhill - design.T @ bend)
+        return float(bend @ bend) + rest - volume
+
+    def _shaped(self, rounds: int, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
+        """Return the roughness after some rounds of expectation and maximization."""
+        one = self
+        for _ in range(rounds):
+            one = one._likelier(hessian, downhill, design, bend)
+        return one
 
     def _likelier(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness with the covariance that differences are expected to have."""
@@ -164,7 +180,7 @@ class Roughness:
         back = np.linalg.inv(self._root)
         covariance = back @ (expected.T @ expected + spread.T @ spread) @ back.T
         covariance += _ALIKE / self._rank(hessian) * np.trace(covariance) / axes * np.eye(axes)
-        covariance /= self._rank(hessian) + _ALIKE
+        covariance /= max(self._rank(hessian) - _UNIFORM, 1.0) + _ALIKE
         size = float(np.linalg.det(covariance)) ** (1 / axes)
         return replace(self, weight=1 / size, shape=size * np.linalg.inv(covariance))
 
@@ -229,3 +245,10 @@ def _differences(intervals: int, order: int, kicks: float) -> Array:
         factor = scipy.linalg.cholesky(covariance, lower=True)
         independent = scipy.linalg.solve_triangular(factor, independent, lower=True)
     return np.asarray(independent)
+
+
+def _unexplained(curvature: Array, downhill: Array) -> float:
+    """Return what is left of a misfit at its least, and the logarithm of its curvature's determinant."""
+    factor = scipy.linalg.cholesky(curvature, lower=True, check_finite=False)
+    gained = scipy.linalg.solve_triangular(factor, downhill, lower=True, check_finite=False)
+    return 2 * float(np.log(np.diag(factor)).sum()) - float(gained @ gained)
