@@ -109,6 +109,21 @@ def test_the_smoother_the_motion_the_higher_the_order_and_the_less_it_errs(inter
     assert Roughness(spline).formed(*measured(angles, 0, spline), path, 0).order == Roughness(spline).order
 
 
+@pytest.mark.parametrize("amplitude", [3e-4, 6e-4])
+def test_errors_come_true_where_the_data_hardly_tell_that_the_motion_is_uneven(amplitude: float) -> None:
+    time = np.linspace(0, 1, 200)
+    values, axis = SPLINE.values(time), 1
+    angles = amplitude * np.sin(9 * time)[:, None] * np.eye(3)[axis]
+    squares = []
+    for seed in range(30):
+        hessian, downhill = measured(angles, seed)
+        hessian = hessian + Roughness(SPLINE).weighed(hessian, downhill, still(), 0).curvature(still(), 0)
+        error = values @ np.linalg.solve(hessian, downhill).reshape(-1, 3)[:, axis] - angles[:, axis]
+        covariance = np.linalg.inv(hessian)[axis::3, axis::3]
+        squares.append(np.mean(error**2 / np.einsum("nb,bc,nc->n", values, covariance, values)))
+    assert 0.7 < np.mean(squares) < 1.4
+
+
 @pytest.mark.parametrize("kicks", [0.0, 100.0])
 def test_the_penalty_has_its_gradient_and_curvature(kicks: float) -> None:
     rng = np.random.default_rng(2)

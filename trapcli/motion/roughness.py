@@ -8,6 +8,10 @@ approximation of the misfit: one search finds its size, expectation and maximiza
 Laird and Rubin 1977, DOI 10.1111/j.2517-6161.1977.tb01600.x). Errors then hold what the penalty may have
 smoothed away (Wahba 1983, DOI 10.1111/j.2517-6161.1983.tb01239.x).
 
+Where frames tell little, the covariance that makes them likeliest is often none at all, and errors would not
+hold what they leave open. So each standard deviation is taken to be as likely beforehand as any other (Gelman
+2006, DOI 10.1214/06-BA117A).
+
 Of which order the differences are is told by the evidence as well: the smoother ω is, the more of its wiggles
 are noise, and the fewer numbers describe it.
 
