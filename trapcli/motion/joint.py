@@ -490,9 +490,8 @@ def _planar(
 
     It may miss them by `patience` times what noise gives.
     """
-    planar = model.fit(
-        fit.path.planar(), fit.low.time, fit.spline, smooth=fit.roughness is not None, axes=(2,)
-    )
+    path, smooth = fit.path.planar(fit.spline), fit.roughness is not None
+    planar = model.fit(path, fit.low.time, fit.spline, smooth=smooth, axes=(2,))
     simpler = model.assess(planar)
     misfit = max(fit.cost / assessment.degrees, 1.0)
     # seen from one side only, the object has fewer parameters too. Turns out of the plane times what they

@@ -133,12 +133,15 @@ class Path:
         omega += np.einsum("...ij,...j->...i", _right_jacobian(delta), slope)
         return Path(self.time, orthonormal(self.R @ turn), omega)
 
-    def planar(self) -> Path:
-        """Return the part of the path that turns about the optical axis, from its first time on."""
-        R = self.R[0].T @ self.R
+    def planar(self, spline: Spline) -> Path:
+        """Return the path of the spline nearest to the part of this one that turns about the optical axis."""
+        time, first = np.unique(self.time, return_index=True)
+        R = self.R[first[0]].T @ self.R[first]
         angle = np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])
         axis = np.array([0.0, 0.0, 1.0])
-        return Path(self.time, Rotation.from_rotvec(angle[:, None] * axis).as_matrix(), self.omega * axis)
+        turned = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+        # what turns about other axes has part in the angle, so that its derivative is not ω₃
+        return Path(time, turned, self.omega[first] * axis).near(spline, self.time)
 
     def mean_omega(self) -> Array:
         """Return the ``(N−1, 3)`` constant angular velocities that lead from each time to the next."""
