@@ -142,6 +142,23 @@ def test_align_leaves_what_is_not_gauge(two_turns: Any) -> None:
     assert 0.002 < angles.mean() < 0.02
 
 
+def test_the_part_about_the_optical_axis_turns_at_its_own_rate() -> None:
+    """What else a path turns about has part in that angle."""
+    spline, time = Spline(0.0, 1.0, 30), np.linspace(0.0, 1.0, 601)
+    coefficients = spline.fit(
+        time, np.stack([3 + 2 * np.sin(5 * time), 2 * time, 4 + np.cos(7 * time)], axis=1)
+    )
+    path = Path.smooth(spline, coefficients, time)
+    planar = path.planar(spline)
+    angle = np.unwrap(np.arctan2(planar.R[:, 1, 0], planar.R[:, 0, 0]))
+    assert np.abs(planar.omega[:, 2] - path.omega[:, 2]).max() > 0.5
+    assert not planar.omega[:, :2].any()
+    np.testing.assert_allclose(np.gradient(angle, time)[1:-1], planar.omega[1:-1, 2], rtol=1e-3)
+    relative = path.R[0].T @ path.R
+    turned = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
+    np.testing.assert_allclose(angle, np.unwrap(turned), atol=2e-3)
+
+
 def test_the_simplest_path_nearby_has_lost_its_wiggles() -> None:
     fine, time = Spline(0.0, 10.0, 60), np.linspace(0, 10, 400)
     omega = np.stack([np.sin(time), np.ones_like(time), 0.1 * time], axis=1)
