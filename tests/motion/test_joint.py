@@ -45,8 +45,10 @@ def render(
 
 
 def estimate(images: Images, time: NDArray[np.float64], **options: Any) -> Motion:
-    motion = joint.estimate_joint(
-        Frames.from_array(images), MotionConfig(), time=time, pixel_size=PIXEL, **options
+    motion = (
+        joint.find_motion(Frames.from_array(images), MotionConfig(), time=time, pixel_size=PIXEL, **options)
+        .refined()
+        .motion()
     )
     return dataclasses.replace(motion, time_unit="s", length_unit="µm")
 
@@ -231,7 +233,7 @@ def test_a_cell_by_wave_optics() -> None:
     """One turn in 220 steps about an axis tilted by 0.2 rad, through light that does not go straight."""
     frames = tifffile.imread(CELL)
     time = np.arange(float(len(frames)))
-    found = joint.estimate_joint(Frames.from_array(frames), MotionConfig(), time=time)
+    found = joint.find_motion(Frames.from_array(frames), MotionConfig(), time=time).refined().motion()
     assert found.identifiable
     omega = np.stack([found.omega_1, found.omega_2, found.omega_3], axis=1)
     speed = np.linalg.norm(omega, axis=1)
@@ -330,7 +332,10 @@ def test_misfits_of_frames_do_not_depend_on_the_band() -> None:
     images, truth = render("single-axis", "blobs", 2)
     frames = Frames.from_array(images)
     narrow, wide = (
-        joint.estimate_joint(frames, MotionConfig(band=band), time=truth.time, pixel_size=PIXEL).residual
+        joint.find_motion(frames, MotionConfig(band=band), time=truth.time, pixel_size=PIXEL)
+        .refined()
+        .motion()
+        .residual
         for band in (17 / 3.4, 22 / 3.4)
     )
     assert np.median(narrow) == pytest.approx(np.median(wide), rel=0.05)

@@ -28,7 +28,11 @@ def scene(seed: int = 2, **motion: object) -> tuple[np.ndarray, Motion]:
 
 
 def estimate(images: np.ndarray, time: np.ndarray) -> Motion:
-    return joint.estimate_joint(Frames.from_array(images), MotionConfig(), time=time, pixel_size=0.2)
+    return (
+        joint.find_motion(Frames.from_array(images), MotionConfig(), time=time, pixel_size=0.2)
+        .refined()
+        .motion()
+    )
 
 
 @pytest.fixture(autouse=True)

@@ -189,22 +189,6 @@ def find_motion(
     return Found(stack, _fine_groups(stack, used, pace), (fit, assessment), bands, config.knots)
 
 
-def estimate_joint(
-    attenuation: Frames,
-    config: MotionConfig,
-    *,
-    time: Array,
-    pixel_size: float = 1.0,
-    progress: Progress | None = None,
-) -> Motion:
-    """Recover the motion from all frames at once, with errors and a verdict.
-
-    Parameters and what is raised are those of `find_motion`.
-    """
-    found = find_motion(attenuation, config, time=time, pixel_size=pixel_size, progress=progress)
-    return found.refined().motion()
-
-
 def _bands(low: LowBand) -> tuple[float, float]:
     """Return the bands of the object model that tells motions apart and of the last [rad / length].
 

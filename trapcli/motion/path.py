@@ -135,13 +135,17 @@ class Path:
 
     def planar(self, spline: Spline) -> Path:
         """Return the path of the spline nearest to the part of this one that turns about the optical axis."""
-        time, first = np.unique(self.time, return_index=True)
-        R = self.R[first[0]].T @ self.R[first]
+        path = self.ascending()
+        R = path.R[0].T @ path.R
         angle = np.arctan2(R[:, 1, 0] - R[:, 0, 1], R[:, 0, 0] + R[:, 1, 1])
-        axis = np.array([0.0, 0.0, 1.0])
-        turned = Rotation.from_rotvec(angle[:, None] * axis).as_matrix()
+        turned = Rotation.from_rotvec(angle[:, None] * np.array([0.0, 0.0, 1.0])).as_matrix()
         # what turns about other axes has part in the angle, so that its derivative is not ω₃
-        return Path(time, turned, self.omega[first] * axis).near(spline, self.time)
+        return replace(path, R=turned).near(spline, self.time)
+
+    def ascending(self) -> Path:
+        """Return the path at its own times in order, each of them once."""
+        time, first = np.unique(self.time, return_index=True)
+        return Path(time, self.R[first], self.omega[first])
 
     def mean_omega(self) -> Array:
         """Return the ``(N−1, 3)`` constant angular velocities that lead from each time to the next."""

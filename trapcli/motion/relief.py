@@ -121,10 +121,10 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
 
     Its ω is the nearest spline.
     """
-    time, first = np.unique(path.time, return_index=True)
-    swing, spin, mean = _swings(path.R[first])
+    ascending = path.ascending()
+    swing, spin, mean = _swings(ascending.R)
     R = mean @ Rotation.from_rotvec(factor * swing).as_matrix() @ spin
-    return Path(time, R, path.omega[first]).near(spline, path.time)
+    return replace(ascending, R=R).near(spline, path.time)
 
 
 def _other_tilts(fit: Fit) -> Iterator[Path]:

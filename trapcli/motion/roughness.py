@@ -157,11 +157,10 @@ class Roughness:
 
     def _surprise(self, hessian: Array, downhill: Array, design: Array, bend: Array) -> float:
         """Return minus twice the logarithm of the evidence, but for what does not depend on roughness."""
-        volume = self._volume(design)
         root = np.sqrt(self.weight)
         design, bend = root * self._weighted(design), root * self._weighted(bend)
         rest = _unexplained(hessian + design.T @ design, downhill - design.T @ bend)
-        return float(bend @ bend) + rest - volume
+        return float(bend @ bend) + rest - _volume(design)
 
     def _shaped(self, rounds: int, hessian: Array, downhill: Array, design: Array, bend: Array) -> Roughness:
         """Return the roughness after some rounds of expectation and maximization."""
@@ -187,13 +186,6 @@ class Roughness:
         covariance /= max(self._rank(hessian) - _UNIFORM, 1.0) + _ALIKE
         size = float(np.linalg.det(covariance)) ** (1 / axes)
         return replace(self, weight=1 / size, shape=size * np.linalg.inv(covariance))
-
-    def _volume(self, design: Array) -> float:
-        """Return the logarithm of the determinant of the curvature; a turn of 1 rad counts 1 as well."""
-        design = np.sqrt(self.weight) * self._weighted(design)
-        # not by the curvature, of which rounding would leave little where ω is smooth
-        factor = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]), mode="r")
-        return 2 * float(np.log(np.abs(np.diag(factor))).sum())
 
     def _rank(self, hessian: Array) -> float:
         """Return how many differences of each component the P coefficients decide.
@@ -256,3 +248,10 @@ def _unexplained(curvature: Array, downhill: Array) -> float:
     factor = scipy.linalg.cholesky(curvature, lower=True, check_finite=False)
     gained = scipy.linalg.solve_triangular(factor, downhill, lower=True, check_finite=False)
     return 2 * float(np.log(np.diag(factor)).sum()) - float(gained @ gained)
+
+
+def _volume(design: Array) -> float:
+    """Return the logarithm of the determinant of ``designᵀ design``; a turn of 1 rad counts 1 as well."""
+    # not by that product, of which rounding would leave little where ω is smooth
+    factor = np.linalg.qr(np.concatenate([design, np.eye(design.shape[1])]), mode="r")
+    return 2 * float(np.log(np.abs(np.diag(factor))).sum())
