@@ -124,7 +124,6 @@ def test_a_newcomer_with_a_bare_clone(tmp_path: Path) -> None:
         language, block = BLOCK.findall(page.read_text(encoding="utf-8"))[0]
         assert language == "sh"
         shutil.rmtree(clone / ".venv", ignore_errors=True)
-        before = sum(os.times()[2:4])
         done = subprocess.run(
             ["bash", "-ec", block], cwd=clone, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
             check=False,
@@ -133,8 +132,6 @@ def test_a_newcomer_with_a_bare_clone(tmp_path: Path) -> None:
             pytest.skip("no package index can be reached")
         assert done.returncode == 0, done.stdout
         assert (clone / least).exists()
-        # time of the processor, user and system: who runs this may be doing other things
-        assert sum(os.times()[2:4]) - before < 120
     assert (clone / "demo" / "auto.png").exists()
 
 
