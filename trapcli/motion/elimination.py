@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 import scipy.sparse
 from numpy.typing import NDArray
 
+from trapcli.motion import triangular
 from trapcli.threads import in_parallel
 
 Array = NDArray[np.float64]
@@ -50,13 +52,12 @@ class ObjectBlock:
             rest = np.eye(count) - self._leaning.T @ self._leaning
             # a shift of all frames that the object follows leaves nothing but the object's own prior
             rest[np.diag_indices(count)] += 1e-14
-            self._rest = scipy.linalg.cholesky(rest, lower=True, overwrite_a=True, check_finite=False)
+            self._rest = triangular.cholesky(rest.T)
             return
         reduced = np.asfortranarray(scipy.linalg.block_diag(*blocks))
         for part in parts:
-            reduced = scipy.linalg.blas.dsyrk(-1.0, part, 1.0, reduced, lower=True, overwrite_c=True)
-        factor = scipy.linalg.cholesky(reduced, lower=True, overwrite_a=True, check_finite=False)
-        self._halves = [scipy.linalg.lapack.dtrtri(factor, lower=True, overwrite_c=True)[0]]
+            triangular.less_square(reduced, part)
+        self._halves = [triangular.inverse_factor(reduced)]
 
     @staticmethod
     def is_dense(n: int, count: int) -> bool:
@@ -77,10 +78,7 @@ class ObjectBlock:
 
     def _multiplied(self, right: Array, transposed: bool) -> Array:
         ends = np.cumsum([len(half) for half in self._halves])[:-1]
-
-        def product(half: Array, part: Array) -> Array:
-            return np.asarray(scipy.linalg.blas.dtrmm(1.0, half, part, lower=True, trans_a=transposed))
-
+        product = partial(triangular.multiplied, transposed=transposed)
         return np.concatenate(in_parallel(product, self._halves, np.split(right, ends)))
 
 

@@ -22,7 +22,7 @@ Complex = NDArray[np.complexfloating[Any, Any]]
 
 _DOUBLE_PRECISION = 1e-12
 _SINGLE_PRECISION = 2e-5
-_FEW = 30_000  # values up to which a second thread costs what it gains
+_FEW = 25_000  # values and halves of lattice points up to which a second thread costs what it gains
 _SPARE = 1.25  # finer grid of the transforms in single precision, which saves memory
 
 
@@ -77,7 +77,7 @@ def project(points: list[Array], lattice: Real | Complex, accuracy: float = _DOU
             *_in_precision(points, single),
             lattice.astype(kind, copy=False),
             isign=-1,
-            **_options(single, lattice[..., 0, 0, 0].size * points[0].size, accuracy),
+            **_options(single, lattice[..., 0, 0, 0].size * points[0].size, lattice.size, accuracy),
         )
     )
 
@@ -95,7 +95,7 @@ def back_project(points: list[Array], values: Complex, size: int) -> Real:
     return np.asarray(gather(points, values, size).real)
 
 
-def gather(points: list[Array], values: Complex, size: int) -> Complex:
+def gather(points: list[Array], values: Complex, size: int, accuracy: float = _DOUBLE_PRECISION) -> Complex:
     """Return ``Σ values exp(i⟨point, b⟩)`` at the lattice points b.
 
     Parameters
@@ -104,6 +104,8 @@ def gather(points: list[Array], values: Complex, size: int) -> Complex:
         ``(M,)`` complex; single or double precision decides that of the result.
     size:
         Lattice points along an edge; b = 0 is at index size // 2.
+    accuracy:
+        Relative to the largest sum, in double precision.
 
     Returns
     -------
@@ -112,7 +114,11 @@ def gather(points: list[Array], values: Complex, size: int) -> Complex:
     """
     single = values.dtype == np.complex64
     lattice: Complex = finufft.nufft3d1(
-        *_in_precision(points, single), values, (size,) * 3, isign=1, **_options(single, values.size)
+        *_in_precision(points, single),
+        values,
+        (size,) * 3,
+        isign=1,
+        **_options(single, values.size, size**3, accuracy),
     )
     return lattice
 
@@ -121,8 +127,8 @@ def _in_precision(points: list[Array], single: bool) -> list[Real]:
     return [p.astype(np.float32 if single else np.float64, copy=False) for p in points]
 
 
-def _options(single: bool, values: int, accuracy: float = _DOUBLE_PRECISION) -> dict[str, Any]:
-    threads = processors() if values > _FEW else 1
+def _options(single: bool, values: int, lattice: int, accuracy: float) -> dict[str, Any]:
+    threads = processors() if values + lattice / 2 > _FEW else 1
     if single:
         return {"eps": _SINGLE_PRECISION, "upsampfac": _SPARE, "nthreads": threads}
     return {"eps": accuracy, "upsampfac": 2.0, "nthreads": threads}

@@ -108,8 +108,8 @@ class Found:
     bands: tuple[float, float]
     knots: int
 
-    def motion(self) -> Motion:
-        """Return the motion as it is."""
+    def motion(self, *, hidden: bool = True) -> Motion:
+        """Return the motion as it is; turns that a symmetry may hide are looked for if `hidden`."""
         if self.best is None:
             return nothing_known(
                 self.stack,
@@ -117,8 +117,13 @@ class Found:
                 "or turns about an axis of symmetry; no rotation can be told",
             )
         verdict = judge(*self.best)
-        unseen = unseen_turn(*self.best, self.bands[0]) if verdict.identifiable else None
+        look = hidden and verdict.identifiable
+        unseen = unseen_turn(*self.best, self.bands[0]) if look else None
         return to_motion(self.stack, *self.best, verdict, unseen)
+
+    def about(self, center: Array) -> LowBand:
+        """Return the low modes of all frames about other centres, ``(N, 2)`` [length]."""
+        return self.stack.low.shifted(center - self.stack.centers.center)
 
     def refined(self) -> Found:
         """Return the likeliest motion near this one, with an object that has its sharp edges."""
@@ -134,6 +139,7 @@ def find_motion(
     *,
     time: Array,
     pixel_size: float = 1.0,
+    near: Found | None = None,
     progress: Progress | None = None,
 ) -> Found:
     """Find the motion from all frames at once.
@@ -148,6 +154,9 @@ def find_motion(
         ``(N,)`` ascending times.
     pixel_size:
         Edge of a pixel [length].
+    near:
+        What was found in much the same frames: where that leads to a motion that explains these, no other is
+        sought.
     progress:
         Called as ``progress(stage, done, total)``.
 
@@ -184,7 +193,8 @@ def find_motion(
     bands = (config.band, config.band) if config.band else _bands(low.select(used))
     if pace == 0.0:
         return Found(stack, low, None, bands, config.knots)
-    fit, assessment = _best_motion(stack, used, pace, bands[0], config.knots, progress)
+    best = None if near is None else _nearby(_fine_groups(stack, used, pace), time, bands[0], near)
+    fit, assessment = best or _best_motion(stack, used, pace, bands[0], config.knots, progress)
     stack, fit, assessment = _quieter(stack, used, pace, fit, assessment)
     return Found(stack, _fine_groups(stack, used, pace), (fit, assessment), bands, config.knots)
 
@@ -205,6 +215,16 @@ def _bands(low: LowBand) -> tuple[float, float]:
     finer = telling[(radial > _FINE_BAND) & (radial <= last)].sum() > _WORTHWHILE * telling.sum()
     first = min(last, _FINE_BAND)
     return first / low.radius, (last if finer else first) / low.radius
+
+
+def _nearby(low: LowBand, time: Array, band: float, near: Found) -> tuple[Fit, Assessment] | None:
+    """Return the motion that one found before leads to, if it is told as well as one that is found."""
+    if near.best is None or near.best[0].axes == (2,):  # beside that, a richer motion is to be looked at
+        return None
+    fit, _ = near.best
+    path = fit.path.sampled(fit.spline, np.concatenate([time, fit.spline.grid, low.time]))
+    best = ObjectModel(low, band, guard=fit.model.guard, prior=fit.model.prior).again(fit, path)
+    return best if _settled(*best, len(time)) else None
 
 
 def _best_motion(

@@ -34,6 +34,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from trapcli.motion import triangular
 from trapcli.motion.elimination import Eliminated, ObjectBlock, bent_blocks
 from trapcli.motion.fourier_slices import back_project, conjugate_share, gather, project, slice_points
 from trapcli.motion.integrate import interpolated
@@ -492,13 +493,13 @@ class ObjectModel:
         # the normal matrix spans ten orders of magnitude, and so must the transforms
         kernel = back_project(points, density, 4 * self._half + 1).ravel()
         across, along = kernel[self._sum], kernel[self._difference]
-        even, odd = along + across, (along - across)[:-1, :-1]
+        even, odd = along + across, along[:-1, :-1] - across[:-1, :-1]
         even[-1] *= np.sqrt(0.5)  # the point in the middle is its own opposite
         even[:, -1] *= np.sqrt(0.5)
         for block, precision in zip((even, odd), self._precision, strict=True):
             block[np.diag_indices(len(block))] += precision
         blocks = [even.copy(), odd.copy()] if ObjectBlock.is_dense(len(self.position), 2 * len(R)) else None
-        halves = in_parallel(_inverse_factor, (even, odd))
+        halves = in_parallel(triangular.inverse_factor, (even.T, odd.T))
         # not the trace of N⁻¹ A Aᵀ, of which rounding would leave little
         unseen = (np.sum(half**2, axis=0) @ own for half, own in zip(halves, self._precision, strict=True))
         seen = float(len(self.position) - sum(unseen))
@@ -540,12 +541,15 @@ class ObjectModel:
 
         First with the modes, then with i times the modes.
         """
-        waves = np.asfortranarray(self._gain * whitened)
-        sums = np.empty((len(self.position), waves.shape[1]), complex)
-        for mode in range(waves.shape[1]):
+        waves = self._gain * whitened
+
+        def sums(mode: int) -> ComplexArray:
             points = [axis.reshape(waves.shape)[:, mode].copy() for axis in views.points]
-            sums[:, mode] = gather(points, waves[:, mode], 2 * self._half + 1)[self._mask]
-        return np.concatenate([sums.real, -sums.imag], axis=1)
+            lattice = gather(points, waves[:, mode].copy(), 2 * self._half + 1, _FAITHFUL)
+            return np.asarray(lattice[self._mask])
+
+        every = np.stack(in_parallel(sums, range(waves.shape[1])), axis=1)
+        return np.concatenate([every.real, -every.imag], axis=1)
 
     def _waves(self, points: list[Array], amplitudes: list[Array]) -> ComplexArray:
         """Return ``(A, G, K)`` modes of A sets of ``(n,)`` amplitudes."""
@@ -783,18 +787,12 @@ class _Tried:
     solution: _Solution
 
 
-def _inverse_factor(block: Array) -> Array:
-    """Return the inverse of the lower Cholesky factor of a symmetric matrix, which is overwritten."""
-    factor = scipy.linalg.cholesky(block.T, lower=True, overwrite_a=True, check_finite=False)
-    return np.asarray(scipy.linalg.lapack.dtrtri(factor, lower=True, overwrite_c=True)[0])
-
-
 def _twice_inverse(half: Array, precision: Array) -> Array:
     """Return the lower triangle of N⁻¹ D N⁻¹, from the inverse of the lower Cholesky factor of N."""
-    lower, _ = scipy.linalg.lapack.dlauum(half, lower=True)
-    lower += np.tril(lower, -1).T
-    lower *= np.sqrt(precision)
-    return np.asarray(scipy.linalg.blas.dsyrk(1.0, lower, lower=True))
+    inverse = triangular.squared(half)
+    inverse += np.tril(inverse, -1).T
+    inverse *= np.sqrt(precision)
+    return -triangular.less_square(np.zeros_like(inverse), inverse)
 
 
 def _turning(R: Array, k: Array, gradient: NDArray[Any]) -> NDArray[Any]:

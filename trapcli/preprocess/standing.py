@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.motion.fourier_slices import conjugate_share
-from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline
@@ -32,8 +31,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_LINE_BAND = 1.0  # band times radius of the reduced map, of which nothing is used
-_BAND = 22.0  # band times radius while the motion is fitted again
+_BAND = 16.0  # band times radius while the motion is fitted again
 _FINEST_BAND = 28.0  # the same in the end: that of the finest object model which judges the motion
 _SPACING = 0.7  # of the points, in units of π / band
 _REACH = 1.1  # of the points, in radii of the object
@@ -51,15 +49,19 @@ _NEGLIGIBLE = 1e-6  # variance of a point, as a share of the typical, that is as
 _CONVINCING = 5.0  # natural logarithm of the odds at which there is a pattern
 
 
-def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> Array | None:
+def find_standing_pattern(
+    low: LowBand, motion: Motion, shape: tuple[int, ...], pixel_size: float
+) -> Array | None:
     """Find what stays in place while the particle moves.
 
     Parameters
     ----------
-    frames:
-        N attenuation projections.
+    low:
+        Modes of N attenuation projections about the centres of the motion.
     motion:
         Of the particle in them, roughly; centres in units of `pixel_size`.
+    shape:
+        H and W of the projections.
     pixel_size:
         Edge of a pixel [length].
 
@@ -72,11 +74,7 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
     known = np.flatnonzero(np.isfinite(motion.R[:, 0, 0]) & np.isfinite(motion.center[:, 0]))
     if len(known) < _FEWEST_GROUPS:
         return None
-    front = read_front_end(
-        frames, time=motion.time, pixel_size=pixel_size, line_band=_LINE_BAND, fine_band=_FINEST_BAND
-    )
-    # the centres that the fit has found are better than those of single frames
-    low = front.low.shifted(motion.center - front.centers.center).select(known)
+    low = low.select(known)
     center, R, time = motion.center[known], motion.R[known], motion.time[known]
     path = Path(time, R, R[:, 0])
     turned = float(np.sum(np.linalg.norm(path.mean_omega(), axis=1) * np.diff(time)))
@@ -101,7 +99,7 @@ def find_standing_pattern(frames: Frames, motion: Motion, pixel_size: float) -> 
             break
     points = _Points.over(low, middle, _FINEST_BAND)
     _, values = _pattern(finest.shifted(fit.shift), path, points)
-    return points.image(values, frames.shape[1:], pixel_size)
+    return points.image(values, shape, pixel_size)
 
 
 def without(frames: Frames, pattern: Array) -> Frames:
