@@ -8,6 +8,7 @@ import scipy.linalg
 
 from trapcli.motion.elimination import ObjectBlock, bent_blocks
 from trapcli.motion.path import Spline
+from trapcli.motion.triangular import inverse_factor
 
 
 @pytest.mark.parametrize("count", [12, 80])
@@ -18,7 +19,7 @@ def test_few_and_many_shifts(count: int) -> None:
     whole = scipy.linalg.block_diag(*blocks)
     shifts = 0.9 * np.linalg.cholesky(whole) @ np.linalg.qr(rng.normal(size=(39, 39)))[0]
     shifts = np.concatenate([0.6 * shifts, 0.6 * shifts, shifts[:, :2] * 0.1], axis=1)[:, :count]
-    halves = [np.linalg.inv(np.linalg.cholesky(block)) for block in blocks]
+    halves = [inverse_factor(np.asfortranarray(block)) for block in blocks]
     parts = np.split(np.asfortranarray(shifts), [count // 3], axis=1)
     block = ObjectBlock(halves, parts, count, blocks if ObjectBlock.is_dense(39, count) else None)
     right = rng.normal(size=(39, 5))

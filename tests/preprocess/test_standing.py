@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 import trapcli
 from trapcli import pipeline
 from trapcli.motion import joint
+from trapcli.motion.front_end import read_front_end
 from trapcli.preprocess import standing
 from trapcli.preprocess.standing import find_standing_pattern, without
 from trapcli.result.motion import Motion
@@ -40,9 +41,17 @@ def specks(highest: float) -> np.ndarray:
     return np.asarray(0.1 * highest * np.sum(spread, axis=0))
 
 
+def pattern_in(frames: np.ndarray, motion: Motion) -> np.ndarray | None:
+    front = read_front_end(
+        Frames.from_array(frames), time=motion.time, pixel_size=PIXEL, line_band=1.0, fine_band=28.0
+    )
+    low = front.low.shifted(motion.center - front.centers.center)
+    return find_standing_pattern(low, motion, frames.shape[1:], PIXEL)
+
+
 def test_where_nothing_stays_nothing_is_found(turning: tuple[np.ndarray, Motion]) -> None:
     frames, truth = turning
-    assert find_standing_pattern(Frames.from_array(frames), truth, PIXEL) is None
+    assert pattern_in(frames, truth) is None
 
 
 def test_dust_is_found_up_to_the_frequencies_that_judge_the_motion() -> None:
@@ -53,7 +62,7 @@ def test_dust_is_found_up_to_the_frequencies_that_judge_the_motion() -> None:
 def test_nothing_is_found_where_the_motion_is_not_known(turning: tuple[np.ndarray, Motion]) -> None:
     frames, truth = turning
     unknown = replace(truth, R=np.full_like(truth.R, np.nan))
-    assert find_standing_pattern(Frames.from_array(frames), unknown, PIXEL) is None
+    assert pattern_in(frames, unknown) is None
 
 
 @pytest.mark.slow
@@ -62,7 +71,7 @@ def test_specks_are_found_though_the_motion_is_off(turning: tuple[np.ndarray, Mo
     dust = specks(float(frames.max()))
     sway = np.deg2rad(0.5) * np.sin(np.linspace(0, 3, len(truth)))[:, None] * [1, -1, 0]
     motion = replace(truth, R=truth.R @ Rotation.from_rotvec(sway).as_matrix())
-    found = find_standing_pattern(Frames.from_array((frames + dust).astype(np.float32)), motion, PIXEL)
+    found = pattern_in((frames + dust).astype(np.float32), motion)
     assert found is not None
     # the pattern holds low frequencies only; what is round about the middle may be the object's
     error, smooth = (ndimage.gaussian_filter(image, 2.0) for image in (found - dust, dust))
@@ -87,7 +96,9 @@ def test_a_pattern_counts_only_where_it_explains_the_images(
     first, second = (
         replace(truth, residual=np.full(len(truth), one)) for one in (2.0, 1.0 if better else 3.0)
     )
-    found, again = (SimpleNamespace(motion=lambda one=one: one) for one in (first, second))
-    taken, chosen = pipeline._without_dust(frames, found, lambda _: again, PIXEL)
+    found, again = (
+        SimpleNamespace(motion=lambda one=one, **_: one, about=lambda _: None) for one in (first, second)
+    )
+    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again, PIXEL)
     assert chosen is (again if better else found)
     assert bool(taken.info.warnings) == better

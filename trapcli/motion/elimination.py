@@ -33,9 +33,9 @@ class ObjectBlock:
     Parameters
     ----------
     halves:
-        Inverses of the lower Cholesky factors of N's diagonal blocks, n × n in all.
+        Inverses of the lower Cholesky factors of N's diagonal blocks, n × n in all, in Fortran's order.
     parts:
-        S in parts of ``(n, any)`` columns.
+        S in parts of ``(n, any)`` columns, in Fortran's order.
     count:
         Columns of S in all.
     blocks:
