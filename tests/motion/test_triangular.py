@@ -28,7 +28,7 @@ def test_the_inverse_factor_whitens() -> None:
 
 def test_what_is_not_positive_has_no_factor() -> None:
     with pytest.raises(np.linalg.LinAlgError):
-        triangular.cholesky(np.diag([1.0, -1.0]))
+        triangular.cholesky(np.asfortranarray(np.diag([1.0, -1.0])))
 
 
 def test_squares_are_taken_off_in_place() -> None:
