@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 import trapcli
 from trapcli.config import from_dict
 from trapcli.motion.path import align
-from trapcli.result.comparison import match, rotation_difference, wrap
+from trapcli.result.comparison import compare, match, rotation_difference, wrap
 from trapcli.result.motion import Flag, Motion
 from trapcli.simulation.config import SimulateConfig
 from trapcli.simulation.motions import Drift, RigidMotion, SingleAxis, Tumbling, true_motion
@@ -44,6 +44,7 @@ CELL = FOLDER.parent / "../shared/data/fdtd_cell_tilted.tif"
 
 PIXEL, INTERVAL = 0.2, 0.01
 IDENTIFIABLE, UNIDENTIFIABLE = 200, 50
+QUANTITIES = ("T", "phi", "omega_3", "alpha", "R")
 IMAGE_X = np.array([1.0, 0.0, 0.0])
 
 
@@ -290,7 +291,16 @@ def measure(row: Row) -> dict[str, Any]:
         "silent": float((found.flags & np.uint16(Flag.THIRD_ORDER_SILENT) > 0).mean()),
     }
     measured |= {name: round(float(value), 4) for name, value in _errors(found, truth).items()}
+    if found.identifiable:
+        measured["coverage"] = _coverage(found, truth)
     return measured
+
+
+def _coverage(found: Motion, truth: Motion) -> dict[str, list[float]]:
+    """Return the shares of errors within one and two of the stated ones, over the valid frames."""
+    errors = compare(found, truth).errors
+    shares = {name: [errors[name].within_1_sigma, errors[name].within_2_sigma] for name in QUANTITIES}
+    return {name: np.round(share, 4).tolist() for name, share in shares.items() if np.isfinite(share).all()}
 
 
 def _errors(found: Motion, truth: Motion) -> dict[str, float]:

@@ -44,6 +44,9 @@ KINDS = (
 )
 """Parts of the titles of scenes that don't tell the rotation."""
 
+NAMES = {"T": "T", "phi": "φ", "omega_3": "ω₃", "alpha": "α", "R": "R"}
+"""Quantities whose errors are stated."""
+
 WORDS = {
     "alpha": "α {:.2f} %",
     "angle": "angle {:.2f}°",
@@ -128,10 +131,25 @@ def _answered(rows: list[dict[str, Any]]) -> list[str]:
             f"Rotation error of the answers: median {np.median(errors):.2f}°, largest {max(errors):.2f}°."
         ]
         text += [f"{len(answers) - len(far)} of {len(answers)} answers keep the promise."]
+        text += _covered([row["coverage"] for row in answers])
     return [
         *text,
         *_listed("Answers that do not", far),
         *_listed("Refused", [r for r in rows if not r["trusted"]]),
+    ]
+
+
+def _covered(shares: list[dict[str, list[float]]]) -> list[str]:
+    """Say how often errors are as small as is stated: the mean over stacks, each by its valid frames."""
+    mean = {name: np.mean([share[name] for share in shares if name in share], axis=0) for name in NAMES}
+    return [
+        "",
+        "| errors within | " + " | ".join(NAMES.values()) + " |",
+        "|---" * (1 + len(NAMES)) + "|",
+        *(
+            f"| {n + 1} σ | " + " | ".join(f"{100 * mean[name][n]:.0f} %" for name in NAMES) + " |"
+            for n in range(2)
+        ),
     ]
 
 
