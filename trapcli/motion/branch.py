@@ -3,6 +3,10 @@
 Random constant angular velocities on a first window are refined to local minima of one noise-weighted
 objective; the best few distinct ones survive while the window grows over the whole stack and the spline that
 bends them gets more knots. A wrong branch that fits a short window does not fit a long one.
+
+A short piece of a motion looks the same as its mirror image ΣRΣ, which turns out of the image plane the other
+way. Where little turns out of it, a path may go over from one to the other: whatever fits worse than before
+is tried the other way round as well.
 """
 
 from __future__ import annotations
@@ -27,8 +31,15 @@ DISTINCT = np.deg2rad(3.0)
 """Mean angle beyond which two motions differ by more than gauge and mirror."""
 
 _PAIRS = 12  # pairs of frames a frame
+_USUAL_TURN = np.deg2rad(2.0)  # from group to group, for which the numbers of groups are meant
+_FEWEST = 12  # groups of the first window
 _REACH = 10  # groups added at each end at a time
+_PER_KNOT = 12  # groups per interval of the spline
 _SHORT = 480  # groups up to which every refinement takes the whole path
+_STRAINED = 1.5  # misfit of groups that are added, in units of those before, from which the mirror is tried
+_PLACES = 80  # where a path may go over into its mirror image that are looked at, and those that are tried
+_TRIED = 8
+_GAIN = 1e-3  # share of the misfit that a change of the path must gain
 _GROWTH = 1.4  # growth of a longer path after which the whole is refined again
 _LARGEST_STEP = 0.4  # radians
 _FASTEST = np.deg2rad(160.0)  # turn over the first window
@@ -175,9 +186,9 @@ def find_branches(
     *,
     window: int,
     middle: float = 0.5,
+    turn: float = _USUAL_TURN,
     starts: int = 32,
     keep: int = 6,
-    groups_per_knot: int = 12,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Hypothesis]:
     """Return the hypotheses that survive on the whole stack, best first.
@@ -187,20 +198,22 @@ def find_branches(
     evidence:
         Line and moment tables of G groups of frames.
     window:
-        Groups in the first window.
+        Groups in the first window, where they turn as usual.
     middle:
         Where in the stack the first window lies: 0 at the start, 1 at the end.
+    turn:
+        From group to group [rad]: where it is more than usual, fewer groups make up a window.
     starts:
         Random constant angular velocities tried on the first window.
     keep:
         Hypotheses carried along.
-    groups_per_knot:
-        Groups per interval of the spline.
     progress:
         Called as ``progress("branches", groups reached, G)``.
     """
     groups = len(evidence.time)
-    window = min(window, groups)
+    density, per_knot = _density(turn), _per_knot(turn)
+    reach = max(1, round(density * _REACH))
+    window = min(max(_FEWEST, round(density * window)), groups)
     low = int(middle * (groups - window))
     high = low + window
     hypotheses = _first_window(evidence.select(low, high), starts, keep)
@@ -208,7 +221,7 @@ def find_branches(
     while high - low < groups:
         if progress is not None:
             progress("branches", high - low, groups)
-        new_low, new_high = max(0, low - _REACH), min(groups, high + _REACH)
+        new_low, new_high = max(0, low - reach), min(groups, high + reach)
         wider = evidence.select(new_low, new_high)
         length = new_high - new_low
         whole = length < _SHORT or length >= _GROWTH * refined or length == groups
@@ -216,16 +229,42 @@ def find_branches(
         grown = []
         for h in hypotheses:
             path = h.path.extended(wider.time, low - new_low, tail)
-            if whole:
-                grown += wider.refine([path], _spline(wider.time, groups_per_knot), 12)
-            else:
-                grown.append(wider.judge(_refine_ends(wider, path, groups_per_knot)))
+
+            plain = _refined(wider, [path], per_knot, whole)
+            grown += plain
+            added = length - (high - low)
+            if plain[0].cost - h.cost > _STRAINED * h.cost * added / (high - low):
+                ends = {low - new_low, high - new_low - 1} - {0, length - 1}
+                grown += _refined(wider, [path.mirrored(end) for end in sorted(ends)], per_knot, whole)
         hypotheses = distinct(grown, keep)
         low, high = new_low, new_high
         refined = length if whole else refined
     if progress is not None:
         progress("branches", groups, groups)
     return hypotheses
+
+
+def turned_back(evidence: Evidence, hypothesis: Hypothesis, turn: float) -> Hypothesis:
+    """Return the motion with parts that were mirror images turned back, as long as that fits better.
+
+    Parameters
+    ----------
+    turn:
+        From group to group [rad].
+    """
+    groups = len(evidence.time)
+    spline = _spline(evidence.time, _per_knot(turn))
+    while True:
+        places = range(1, groups - 1, max(1, groups // _PLACES))
+        raw = np.array([evidence.judge(hypothesis.path.mirrored(place)).cost for place in places])
+        padded = np.concatenate([[np.inf], raw, [np.inf]])
+        lowest = np.flatnonzero((raw <= padded[:-2]) & (raw <= padded[2:]))
+        likely = [places[i] for i in lowest[np.argsort(raw[lowest])[:_TRIED]]]
+        tried = evidence.refine([hypothesis.path.mirrored(place) for place in likely], spline, 12)
+        best = min(tried, key=lambda one: one.cost)
+        if best.cost > (1 - _GAIN) * hypothesis.cost:
+            return hypothesis
+        hypothesis = best
 
 
 def distinct(candidates: list[C], keep: int) -> list[C]:
@@ -241,8 +280,24 @@ def distinct(candidates: list[C], keep: int) -> list[C]:
     return kept
 
 
+def _density(turn: float) -> float:
+    """Return how many groups there are to a turn, as a share of the usual."""
+    return float(min(1.0, _USUAL_TURN / turn))
+
+
+def _per_knot(turn: float) -> int:
+    return max(2, round(_density(turn) * _PER_KNOT))
+
+
 def _spline(time: Array, groups_per_knot: int) -> Spline:
     return Spline(time[0], time[-1], max(2, round(len(time) / groups_per_knot)))
+
+
+def _refined(evidence: Evidence, paths: list[Path], per_knot: int, whole: bool) -> list[Hypothesis]:
+    """Refine paths, or their ends only."""
+    if whole:
+        return evidence.refine(paths, _spline(evidence.time, per_knot), 12)
+    return [evidence.judge(_refine_ends(evidence, path, per_knot)) for path in paths]
 
 
 def _refine_ends(evidence: Evidence, path: Path, groups_per_knot: int) -> Path:

@@ -16,7 +16,15 @@ from numpy.typing import NDArray
 from trapcli.config import MotionConfig
 from trapcli.errors import InputError
 from trapcli.motion.ambiguity import unseen_turn
-from trapcli.motion.branch import DISTINCT, Candidate, Evidence, Hypothesis, distinct, find_branches
+from trapcli.motion.branch import (
+    DISTINCT,
+    Candidate,
+    Evidence,
+    Hypothesis,
+    distinct,
+    find_branches,
+    turned_back,
+)
 from trapcli.motion.centers import Progress
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.front_end import read_front_end
@@ -62,6 +70,7 @@ _ATTEMPTS = (
     (50, 0.85),
     (120, 0.5),
 )  # first window [groups] and where it lies
+_TURNED_BACK = 2  # hypotheses of which parts may be mirror images
 _FITS = 1.5  # misfit per degree of freedom of lines and moments up to which one window will do at first
 _LIKELY = 1.3  # cost, in units of the best's, up to which a hypothesis is looked into further
 _MOST_HYPOTHESES = 2, 16  # of them at most, of the first window that fits and of all
@@ -360,6 +369,9 @@ def _outliers(low: LowBand) -> Bools:
         padded = np.concatenate([[0.0], misfit, [0.0]])
         worst = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
         typical = np.array([np.median(misfit[max(0, i - 12) : i + 13]) for i in range(len(misfit))])
+        # where the motion is fast all frames nearby differ from their neighbours, also those it doesn't touch
+        aside = np.stack([np.roll(np.pad(misfit, 3, constant_values=np.nan), lag) for lag in (-3, -2, 2, 3)])
+        typical = np.maximum(typical, np.nanmedian(aside[:, 3:-3], axis=0))
         bad = worst & (misfit > _OUTLYING * np.maximum(typical, 1.0))
         if not bad.any() or good.sum() - bad.sum() < 0.8 * n:
             return ~good
@@ -418,9 +430,12 @@ def _hypotheses(
     yielded: list[Hypothesis] = []
     for attempt, (window, middle) in enumerate(_ATTEMPTS):
         last, tried = attempt == len(_ATTEMPTS) - 1, replace(evidence, seed=attempt)
-        branches = find_branches(tried, window=window, middle=middle, progress=progress)
+        branches = find_branches(tried, window=window, middle=middle, turn=size * pace, progress=progress)
         found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_HYPOTHESES[1])
         fits = found[0].lines < _FITS and found[0].moments < _FITS
+        if last:
+            again = [turned_back(evidence, h, size * pace) for h in found[:_TURNED_BACK]]
+            found = distinct([*again, *found], _MOST_HYPOTHESES[1])
         if last or (fits and not yielded):
             most = _MOST_HYPOTHESES[1 if yielded else 0]
             likely = [h for h in found[:most] if h.cost <= _LIKELY * found[0].cost]

@@ -142,6 +142,17 @@ class Path:
         # what turns about other axes has part in the angle, so that its derivative is not ω₃
         return replace(path, R=turned).near(spline, self.time)
 
+    def mirrored(self, index: int) -> Path:
+        """Return the path that goes on from the time at `index` as its mirror image, ΣRΣ, does.
+
+        What turns out of the image plane changes its sign there.
+        """
+        R, omega = self.R.copy(), self.omega.copy()
+        joint, sigma = R[index], np.diag([1.0, 1.0, -1.0])
+        R[index:] = joint @ sigma @ (joint.T @ R[index:]) @ sigma
+        omega[index:, :2] *= -1
+        return Path(self.time, R, omega)
+
     def ascending(self) -> Path:
         """Return the path at its own times in order, each of them once."""
         time, first = np.unique(self.time, return_index=True)
