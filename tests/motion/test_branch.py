@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from trapcli.motion.branch import Evidence, Hypothesis, distinct, find_branches
+from trapcli.motion.branch import Evidence, Hypothesis, distinct, find_branches, turned_back
 from trapcli.motion.centers import Centers
 from trapcli.motion.common_line import LineTable
 from trapcli.motion.low_band import read_low_band
@@ -67,6 +67,13 @@ def tumbling() -> Scene:
 @pytest.fixture(scope="module")
 def single_axis() -> Scene:
     return make_scene(SingleAxis.from_turns(turns=0.6, duration=1.0), 0.01)
+
+
+@pytest.fixture(scope="module")
+def fast() -> Scene:
+    """8 degrees from frame to frame, 480 in all, about an axis that goes around itself."""
+    motion = Tumbling.random(np.random.default_rng(4), total_angle=480.0, duration=1.0)
+    return make_scene(motion, 0.01)
 
 
 def off(path: Path, truth: Path) -> float:
@@ -168,6 +175,30 @@ def test_the_branch_is_found_without_a_starting_value(name: str, request: pytest
     assert found[0].moments < 1.3
     assert calls[-1] == ("branches", FRAMES, FRAMES)
     assert np.abs(np.swapaxes(found[0].path.R, 1, 2) @ found[0].path.R - np.eye(3)).max() < 1e-9
+
+
+def test_a_fast_motion_is_found_in_windows_of_fewer_frames(fast: Scene) -> None:
+    found = find_branches(fast.evidence, window=50, turn=np.deg2rad(8.0), starts=12, keep=3)
+    assert off(found[0].path, fast.path) < 5
+    assert found[0].lines < 1.2
+
+
+@pytest.mark.parametrize("places", [[20], [15, 40]])
+def test_what_is_its_mirror_image_in_part_is_turned_back(tumbling: Scene, places: list[int]) -> None:
+    path = tumbling.path
+    for place in places:
+        path = path.mirrored(place)
+    assert off(path, tumbling.path) > 5
+    evidence = tumbling.evidence
+    found = turned_back(evidence, evidence.judge(path), np.deg2rad(200 / FRAMES))
+    assert off(found.path, tumbling.path) < 1
+    assert found.cost < evidence.judge(path).cost
+
+
+def test_the_right_motion_is_left_as_it_is(tumbling: Scene) -> None:
+    evidence = tumbling.evidence
+    (right,) = evidence.refine([tumbling.path], Spline(0.0, 1.0, 8), 20)
+    assert turned_back(evidence, right, np.deg2rad(200 / FRAMES)).cost > 0.99 * right.cost
 
 
 def test_the_search_is_the_same_every_time(tumbling: Scene) -> None:

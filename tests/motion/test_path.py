@@ -125,6 +125,21 @@ def test_an_extended_path_goes_on_at_the_rate_of_its_ends() -> None:
     assert extended.omega == pytest.approx(whole.omega, abs=1e-12)
 
 
+def test_a_path_goes_on_as_its_mirror_image(two_turns: Any) -> None:
+    time = np.linspace(0, 1, 400)
+    path = Path(time, two_turns.rotations(time), two_turns.omega(time))
+    other = path.mirrored(150)
+    assert pytest.approx(path.R[:151], abs=1e-12) == other.R[:151]
+    steps, mirrored = (np.swapaxes(p.R[150:-1], 1, 2) @ p.R[151:] for p in (path, other))
+    np.testing.assert_allclose(mirrored, SIGMA @ steps @ SIGMA, atol=1e-12)
+    # its omega is that of its rotations
+    np.testing.assert_allclose(
+        other.mean_omega()[160:], other.omega[160:-1], atol=0.02 * np.abs(path.omega).max()
+    )
+    assert pytest.approx(path.R, abs=1e-12) == other.mirrored(150).R
+    assert align(path.mirrored(0).R, path.R)[0].max() < 1e-12
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_align_removes_the_gauge_exactly(two_turns: Any, rng: np.random.Generator, mirrored: bool) -> None:
     R = two_turns.rotations(np.linspace(0, 2, 50))

@@ -369,9 +369,10 @@ def _outliers(low: LowBand) -> Bools:
         padded = np.concatenate([[0.0], misfit, [0.0]])
         worst = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
         typical = np.array([np.median(misfit[max(0, i - 12) : i + 13]) for i in range(len(misfit))])
-        # where the motion is fast all frames nearby differ from their neighbours, also those it doesn't touch
-        aside = np.stack([np.roll(np.pad(misfit, 3, constant_values=np.nan), lag) for lag in (-3, -2, 2, 3)])
-        typical = np.maximum(typical, np.nanmedian(aside[:, 3:-3], axis=0))
+        # where the motion is fast, frames differ from their neighbours that no outlier is part of
+        beside = np.pad(misfit, 3, mode="reflect")
+        beside = np.median([beside[:-6], beside[1:-5], beside[5:-1], beside[6:]], axis=0)
+        typical = np.maximum(typical, beside)
         bad = worst & (misfit > _OUTLYING * np.maximum(typical, 1.0))
         if not bad.any() or good.sum() - bad.sum() < 0.8 * n:
             return ~good
