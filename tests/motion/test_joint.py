@@ -187,9 +187,9 @@ def test_outlying_frames_are_flagged_and_spoil_nothing(tumbling: tuple[Motion, M
 
 @pytest.mark.parametrize("spoilt", [[], [20], [60], [59, 64], [20, 60]])
 def test_fast_frames_are_no_outliers(spoilt: list[int]) -> None:
-    """The pace goes from 1 to 12 degrees a frame and back within 30 frames."""
+    """The pace goes from 1 to 12 degrees a frame and back within 20 frames."""
     rng = np.random.default_rng(0)
-    pace = 1 + 11 * np.exp(-(((np.arange(120) - 60) / 8) ** 2))
+    pace = 1 + 11 * np.exp(-(((np.arange(120) - 60) / 5) ** 2))
     modes = np.exp(1j * np.outer(np.cumsum(np.deg2rad(pace)), np.arange(1, 9)))
     modes += 0.01 * (rng.normal(size=modes.shape) + 1j * rng.normal(size=modes.shape))
     modes[spoilt] += 1.5
