@@ -33,8 +33,6 @@ if TYPE_CHECKING:  # each method is imported only when it is used
 
 Progress = Callable[[str, int, int], None]
 
-_CLEARINGS = 3  # of what stays in place, at most
-
 
 def estimate(
     frames: Frames | NDArray[Any],
@@ -151,29 +149,20 @@ def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: An
 def _without_dust(
     projections: Frames, found: Found, find: Callable[[Frames, Found], Found], pixel_size: float
 ) -> tuple[Frames, Found]:
-    """Take off what stays in place under the particle, as long as that explains the images better."""
+    """Take off what stays in place under the particle, if that explains the images better."""
     from trapcli.preprocess.standing import find_standing_pattern, without
 
-    cleared, pattern = projections, np.zeros(projections.shape[1:])
     motion = found.motion(hidden=False)
-    # told by a wrong motion, a pattern is wrong in part, but the next motion is less so
-    for _ in range(_CLEARINGS):
-        more = find_standing_pattern(found.about(motion.center), motion, projections.shape[1:], pixel_size)
-        if more is None:
-            break
-        pattern = pattern + more
-        once_more = without(projections, pattern)
-        found_again = find(once_more, found)
-        again = found_again.motion(hidden=False)
-        both = np.isfinite(motion.residual) & np.isfinite(again.residual)
-        if not both.any() or again.identifiable < motion.identifiable:
-            break
-        if np.mean(again.residual[both] ** 2) >= np.mean(motion.residual[both] ** 2):
-            break
-        cleared, found, motion = once_more, found_again, again
-        if found.certain:
-            break
-    return cleared, found
+    pattern = find_standing_pattern(found.about(motion.center), motion, projections.shape[1:], pixel_size)
+    if pattern is None:
+        return projections, found
+    cleared = without(projections, pattern)
+    found_again = find(cleared, found)
+    again = found_again.motion(hidden=False)
+    both = np.isfinite(motion.residual) & np.isfinite(again.residual)
+    better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False
+    better = better and again.identifiable >= motion.identifiable
+    return (cleared, found_again) if better else (projections, found)
 
 
 def _from_array(frames: Any) -> Frames:

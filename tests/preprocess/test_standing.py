@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,35 +96,9 @@ def test_a_pattern_counts_only_where_it_explains_the_images(
     first, second = (
         replace(truth, residual=np.full(len(truth), one)) for one in (2.0, 1.0 if better else 3.0)
     )
-    found, again = (Stand(one) for one in (first, second))
-    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again, PIXEL)  # type: ignore[arg-type]
+    found, again = (
+        SimpleNamespace(motion=lambda one=one, **_: one, about=lambda _: None) for one in (first, second)
+    )
+    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again, PIXEL)
     assert chosen is (again if better else found)
     assert bool(taken.info.warnings) == better
-
-
-def test_patterns_are_taken_off_until_the_motion_is_certain(
-    turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
-    monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: specks(0.5))
-    motions = [replace(truth, residual=np.full(len(truth), one)) for one in (4.0, 3.0, 2.0, 1.0)]
-    first, *others = (Stand(motion, certain=i == 2) for i, motion in enumerate(motions))
-    left = iter(others)
-    taken, chosen = pipeline._without_dust(frames, first, lambda *_: next(left), PIXEL)  # type: ignore[arg-type]
-    assert chosen is others[1]
-    np.testing.assert_allclose(taken.to_array(), frames.to_array() - specks(1.0), atol=1e-5)
-    assert len(taken.info.warnings) == 1
-
-
-@dataclass
-class Stand:
-    """What takes the place of a motion that was found."""
-
-    known: Motion
-    certain: bool = True
-
-    def motion(self, *, hidden: bool) -> Motion:
-        return self.known
-
-    def about(self, center: np.ndarray) -> None:
-        """Return nothing, of which nothing is made."""

@@ -117,11 +117,6 @@ class Found:
     bands: tuple[float, float]
     knots: int
 
-    @property
-    def certain(self) -> bool:
-        """Whether noise alone explains what the motion leaves over."""
-        return self.best is not None and certified(*self.best)
-
     def motion(self, *, hidden: bool = True) -> Motion:
         """Return the motion as it is; turns that a symmetry may hide are looked for if `hidden`."""
         if self.best is None:
