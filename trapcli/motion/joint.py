@@ -232,7 +232,7 @@ def _nearby(low: LowBand, time: Array, band: float, near: Found) -> tuple[Fit, A
         return None
     fit, _ = near.best
     path = fit.path.sampled(fit.spline, np.concatenate([time, fit.spline.grid, low.time]))
-    best = ObjectModel(low, band, guard=fit.model.guard, prior=fit.model.prior).again(fit, path)
+    best = ObjectModel.likeliest(low, band, path.R[-len(low.time) :]).again(fit, path)
     return best if _settled(*best, len(time)) else None
 
 

@@ -31,7 +31,7 @@ from trapcli.stack.frames import Frames
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_BAND = 16.0  # band times radius while the motion is fitted again
+_BAND = 22.0  # band times radius while the motion is fitted again
 _FINEST_BAND = 28.0  # the same in the end: that of the finest object model which judges the motion
 _SPACING = 0.7  # of the points, in units of π / band
 _REACH = 1.1  # of the points, in radii of the object
