@@ -31,7 +31,7 @@ from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel, refitted
-from trapcli.motion.path import Spline, align
+from trapcli.motion.path import Path, Spline, align
 from trapcli.motion.relief import relieved, score, widened
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
@@ -202,7 +202,9 @@ def find_motion(
     bands = (config.band, config.band) if config.band else _bands(low.select(used))
     if pace == 0.0:
         return Found(stack, low, None, bands, config.knots)
-    best = None if near is None else _nearby(_fine_groups(stack, used, pace), time, bands[0], near)
+    best = (
+        None if near is None else _nearby(_fine_groups(stack, used, pace), time, bands[0], config.knots, near)
+    )
     fit, assessment = best or _best_motion(stack, used, pace, bands[0], config.knots, progress)
     stack, fit, assessment = _quieter(stack, used, pace, fit, assessment)
     return Found(stack, _fine_groups(stack, used, pace), (fit, assessment), bands, config.knots)
@@ -226,13 +228,12 @@ def _bands(low: LowBand) -> tuple[float, float]:
     return first / low.radius, (last if finer else first) / low.radius
 
 
-def _nearby(low: LowBand, time: Array, band: float, near: Found) -> tuple[Fit, Assessment] | None:
-    """Return the motion that one found before leads to, if it is told as well as one that is found."""
-    if near.best is None or near.best[0].axes == (2,):  # beside that, a richer motion is to be looked at
+def _nearby(low: LowBand, time: Array, band: float, knots: int, near: Found) -> tuple[Fit, Assessment] | None:
+    """Return the motion that one found before leads to, if that is as good as one that is sought."""
+    if near.best is None:
         return None
-    fit, _ = near.best
-    path = fit.path.sampled(fit.spline, np.concatenate([time, fit.spline.grid, low.time]))
-    best = ObjectModel.likeliest(low, band, path.R[-len(low.time) :]).again(fit, path)
+    (coarse,) = _coarse_fits([near.best[0].path.ascending()], low, time, band, knots)
+    best = _fine_fit(coarse, ObjectModel.likeliest(low, band, coarse.R), smooth=not knots)
     return best if _settled(*best, len(time)) else None
 
 
@@ -251,7 +252,7 @@ def _best_motion(
     best: tuple[Fit, Assessment] | None = None
     for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
-        coarse += _coarse_fits(hypotheses, low, stack.low.time, band, knots)
+        coarse += _coarse_fits([h.path for h in hypotheses], low, stack.low.time, band, knots)
         rivals = distinct(coarse, most)
         near = [fit for fit in rivals if fit.cost <= _RIVAL * rivals[0].cost]
         new = [fit for fit in near if not any(_repeats(fit, other) for other in tried)]
@@ -446,10 +447,8 @@ def _hypotheses(
                 yield new
 
 
-def _coarse_fits(
-    hypotheses: list[Hypothesis], low: LowBand, time: Array, band: float, knots: int
-) -> list[Fit]:
-    """Fit a coarse object model along hypotheses, with as many knots as turns may need where it pays."""
+def _coarse_fits(paths: list[Path], low: LowBand, time: Array, band: float, knots: int) -> list[Fit]:
+    """Fit a coarse object model along paths, with as many knots as turns may need where it pays."""
 
     def light(fit: Fit) -> Fit:
         return replace(fit, known=None)  # normal equations of many motions would take much memory
@@ -457,7 +456,7 @@ def _coarse_fits(
     model = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
     first: list[Fit] = []
     finer: list[Spline] = []
-    for path in (h.path for h in hypotheses):
+    for path in paths:
         turned = float(np.linalg.norm(path.mean_omega(), axis=1).mean() * np.ptp(low.time))
         rough, fine = (
             Spline(time[0], time[-1], min(max(least, round(turned / angle)), len(low.time) // 3, _MOST_KNOTS))
