@@ -131,7 +131,7 @@ def _answered(rows: list[dict[str, Any]]) -> list[str]:
             f"Rotation error of the answers: median {np.median(errors):.2f}°, largest {max(errors):.2f}°."
         ]
         text += [f"{len(answers) - len(far)} of {len(answers)} answers keep the promise."]
-        text += _covered([row["coverage"] for row in answers])
+        text += _covered([row["coverage"] for row in answers if "coverage" in row])
     return [
         *text,
         *_listed("Answers that do not", far),
@@ -141,10 +141,12 @@ def _answered(rows: list[dict[str, Any]]) -> list[str]:
 
 def _covered(shares: list[dict[str, list[float]]]) -> list[str]:
     """Say how often errors are as small as is stated: the mean over stacks, each by its valid frames."""
+    if not shares:
+        return []
     mean = {name: np.mean([share[name] for share in shares if name in share], axis=0) for name in NAMES}
     return [
         "",
-        "| errors within | " + " | ".join(NAMES.values()) + " |",
+        f"| {len(shares)} answers, errors within | " + " | ".join(NAMES.values()) + " |",
         "|---" * (1 + len(NAMES)) + "|",
         *(
             f"| {n + 1} σ | " + " | ".join(f"{100 * mean[name][n]:.0f} %" for name in NAMES) + " |"
