@@ -39,6 +39,7 @@ _SHORT = 480  # groups up to which every refinement takes the whole path
 _STRAINED = 1.5  # misfit of groups that are added, in units of those before, from which the mirror is tried
 _PLACES = 80  # where a path may go over into its mirror image that are looked at, and those that are tried
 _TRIED = 8
+_TURNS_BACK = 12  # of parts of a path, at most
 _GAIN = 1e-3  # share of the misfit that a change of the path must gain
 _GROWTH = 1.4  # growth of a longer path after which the whole is refined again
 _LARGEST_STEP = 0.4  # radians
@@ -254,7 +255,7 @@ def turned_back(evidence: Evidence, hypothesis: Hypothesis, turn: float) -> Hypo
     """
     groups = len(evidence.time)
     spline = _spline(evidence.time, _per_knot(turn))
-    while True:
+    for _ in range(_TURNS_BACK):
         places = range(1, groups - 1, max(1, groups // _PLACES))
         raw = np.array([evidence.judge(hypothesis.path.mirrored(place)).cost for place in places])
         padded = np.concatenate([[np.inf], raw, [np.inf]])
@@ -263,8 +264,9 @@ def turned_back(evidence: Evidence, hypothesis: Hypothesis, turn: float) -> Hypo
         tried = evidence.refine([hypothesis.path.mirrored(place) for place in likely], spline, 12)
         best = min(tried, key=lambda one: one.cost)
         if best.cost > (1 - _GAIN) * hypothesis.cost:
-            return hypothesis
+            break
         hypothesis = best
+    return hypothesis
 
 
 def distinct(candidates: list[C], keep: int) -> list[C]:
