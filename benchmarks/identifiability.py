@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from identifiability_page import write_page
+from identifiability_page import NAMES, write_page
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -44,7 +44,6 @@ CELL = FOLDER.parent / "../shared/data/fdtd_cell_tilted.tif"
 
 PIXEL, INTERVAL = 0.2, 0.01
 IDENTIFIABLE, UNIDENTIFIABLE = 200, 50
-QUANTITIES = ("T", "phi", "omega_3", "alpha", "R")
 IMAGE_X = np.array([1.0, 0.0, 0.0])
 
 
@@ -299,7 +298,7 @@ def measure(row: Row) -> dict[str, Any]:
 def _coverage(found: Motion, truth: Motion) -> dict[str, list[float]]:
     """Return the shares of errors within one and two of the stated ones, over the valid frames."""
     errors = compare(found, truth).errors
-    shares = {name: [errors[name].within_1_sigma, errors[name].within_2_sigma] for name in QUANTITIES}
+    shares = {name: [errors[name].within_1_sigma, errors[name].within_2_sigma] for name in NAMES}
     return {name: np.round(share, 4).tolist() for name, share in shares.items() if np.isfinite(share).all()}
 
 

@@ -230,7 +230,6 @@ def find_branches(
         grown = []
         for h in hypotheses:
             path = h.path.extended(wider.time, low - new_low, tail)
-
             plain = _refined(wider, [path], per_knot, whole)
             grown += plain
             added = length - (high - low)
@@ -255,8 +254,8 @@ def turned_back(evidence: Evidence, hypothesis: Hypothesis, turn: float) -> Hypo
     """
     groups = len(evidence.time)
     spline = _spline(evidence.time, _per_knot(turn))
+    places = range(1, groups - 1, max(1, groups // _PLACES))
     for _ in range(_TURNS_BACK):
-        places = range(1, groups - 1, max(1, groups // _PLACES))
         raw = np.array([evidence.judge(hypothesis.path.mirrored(place)).cost for place in places])
         padded = np.concatenate([[np.inf], raw, [np.inf]])
         lowest = np.flatnonzero((raw <= padded[:-2]) & (raw <= padded[2:]))

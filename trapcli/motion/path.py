@@ -19,6 +19,7 @@ from trapcli.motion.integrate import integrate_rotation
 Array = NDArray[np.float64]
 
 _FEWEST = 3  # intervals of the simplest path that is tried
+_SIGMA = np.diag([1.0, 1.0, -1.0])  # mirrors at the image plane
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,8 @@ class Path:
         What turns out of the image plane changes its sign there.
         """
         R, omega = self.R.copy(), self.omega.copy()
-        joint, sigma = R[index], np.diag([1.0, 1.0, -1.0])
-        R[index:] = joint @ sigma @ (joint.T @ R[index:]) @ sigma
+        joint = R[index]
+        R[index:] = joint @ _SIGMA @ (joint.T @ R[index:]) @ _SIGMA
         omega[index:, :2] *= -1
         return Path(self.time, R, omega)
 
@@ -199,9 +200,8 @@ def align(R: Array, reference: Array) -> tuple[Array, bool]:
         ``(N,)`` remaining angles [rad] and whether the mirror image of R fits better.
     """
     best: tuple[Array, bool] | None = None
-    sigma = np.diag([1.0, 1.0, -1.0])
     for mirrored in (False, True):
-        other = sigma @ R @ sigma if mirrored else R
+        other = _SIGMA @ R @ _SIGMA if mirrored else R
         constant = _between(other, reference)
         angles = Rotation.from_matrix(np.swapaxes(constant @ reference, 1, 2) @ other).magnitude()
         if best is None or angles.mean() < best[0].mean():
@@ -212,9 +212,8 @@ def align(R: Array, reference: Array) -> tuple[Array, bool]:
 
 def deviation(R: Array, reference: Array) -> Array:
     """Return ``(N, 3)`` rotation vectors in the lab from R to a reference, their gauge removed [rad]."""
-    sigma = np.diag([1.0, 1.0, -1.0])
     if align(R, reference)[1]:
-        reference = sigma @ reference @ sigma
+        reference = _SIGMA @ reference @ _SIGMA
     turns = np.swapaxes(R, 1, 2) @ _between(R, reference) @ reference
     return np.asarray(Rotation.from_matrix(turns).as_rotvec())
 
