@@ -137,8 +137,8 @@ def _paper(projections: Frames, config: MotionConfig, guessed: bool, **about: An
 def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: Any) -> tuple[Frames, Motion]:
     from trapcli.motion.joint import find_motion
 
-    def find(projections: Frames, near: Found | None = None) -> Found:
-        return find_motion(projections, config, near=near, **about)
+    def find(projections: Frames) -> Found:
+        return find_motion(projections, config, **about)
 
     found = find(projections)
     if guessed:
@@ -147,17 +147,20 @@ def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: An
 
 
 def _without_dust(
-    projections: Frames, found: Found, find: Callable[[Frames, Found], Found], pixel_size: float
+    projections: Frames, found: Found, find: Callable[[Frames], Found], pixel_size: float
 ) -> tuple[Frames, Found]:
     """Take off what stays in place under the particle, if that explains the images better."""
     from trapcli.preprocess.standing import find_standing_pattern, without
 
-    motion = found.motion(hidden=False)
-    pattern = find_standing_pattern(found.about(motion.center), motion, projections.shape[1:], pixel_size)
+    if found.best is None:
+        return projections, found
+    motion, (fit, _) = found.motion(hidden=False), found.best
+    pattern = find_standing_pattern(found.about(motion.center), motion, fit.model)
     if pattern is None:
         return projections, found
-    cleared = without(projections, pattern)
-    found_again = find(cleared, found)
+    cleared = without(projections, pattern.image(projections.shape[1:], pixel_size))
+    # where the motion found before explains no more than it did, another one may
+    found_again = found.without(pattern.modes(found.stack.centers.center)) or find(cleared)
     again = found_again.motion(hidden=False)
     both = np.isfinite(motion.residual) & np.isfinite(again.residual)
     better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False

@@ -14,8 +14,10 @@ import trapcli
 from trapcli import pipeline
 from trapcli.motion import joint
 from trapcli.motion.front_end import read_front_end
+from trapcli.motion.low_band import read_low_band
+from trapcli.motion.object_model import ObjectModel
 from trapcli.preprocess import standing
-from trapcli.preprocess.standing import find_standing_pattern, without
+from trapcli.preprocess.standing import StandingPattern, find_standing_pattern, without
 from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
 
@@ -41,12 +43,12 @@ def specks(highest: float) -> np.ndarray:
     return np.asarray(0.1 * highest * np.sum(spread, axis=0))
 
 
-def pattern_in(frames: np.ndarray, motion: Motion) -> np.ndarray | None:
+def pattern_in(frames: np.ndarray, motion: Motion) -> StandingPattern | None:
     front = read_front_end(
         Frames.from_array(frames), time=motion.time, pixel_size=PIXEL, line_band=1.0, fine_band=28.0
     )
     low = front.low.shifted(motion.center - front.centers.center)
-    return find_standing_pattern(low, motion, frames.shape[1:], PIXEL)
+    return find_standing_pattern(low, motion, ObjectModel(low, 22.0 / low.radius))
 
 
 def test_where_nothing_stays_nothing_is_found(turning: tuple[np.ndarray, Motion]) -> None:
@@ -74,8 +76,28 @@ def test_specks_are_found_though_the_motion_is_off(turning: tuple[np.ndarray, Mo
     found = pattern_in((frames + dust).astype(np.float32), motion)
     assert found is not None
     # the pattern holds low frequencies only; what is round about the middle may be the object's
-    error, smooth = (ndimage.gaussian_filter(image, 2.0) for image in (found - dust, dust))
+    image = found.image(dust.shape, PIXEL)
+    error, smooth = (ndimage.gaussian_filter(one, 2.0) for one in (image - dust, dust))
     assert np.abs(error - error.mean()).max() < 0.25 * smooth.max()
+
+
+def test_the_modes_of_a_pattern_are_those_of_its_image(turning: tuple[np.ndarray, Motion]) -> None:
+    frames, truth = turning
+    front = read_front_end(
+        Frames.from_array(frames), time=truth.time, pixel_size=PIXEL, line_band=1.0, fine_band=22.0
+    )
+    points = standing._Points.over(front.low, np.array([0.4, -0.8]), 22.0)
+    away = np.linalg.norm(points.place - [1.5, -1.0], axis=1)
+    pattern = StandingPattern(points, np.exp(-0.5 * (away / 1.2) ** 2))
+
+    def seen(images: np.ndarray) -> np.ndarray:
+        band = 22.0 / front.low.radius
+        stack = Frames.from_array(images)
+        return read_low_band(stack, front.centers, time=truth.time, band=band, pixel_size=PIXEL).modes
+
+    added = seen(frames + pattern.image((SIZE, SIZE), PIXEL)) - seen(frames)
+    modes = pattern.modes(front.centers.center)
+    assert np.abs(added - modes).max() < 1e-3 * np.abs(modes).max()
 
 
 def test_a_pattern_is_taken_off_every_frame(turning: tuple[np.ndarray, Motion]) -> None:
@@ -88,17 +110,24 @@ def test_a_pattern_is_taken_off_every_frame(turning: tuple[np.ndarray, Motion]) 
 
 
 @pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize("anew", [True, False])
 def test_a_pattern_counts_only_where_it_explains_the_images(
-    better: bool, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
+    better: bool, anew: bool, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
-    monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: specks(1.0))
+    pattern = SimpleNamespace(image=lambda *_: specks(1.0), modes=lambda center: center)
+    monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: pattern)
     first, second = (
         replace(truth, residual=np.full(len(truth), one)) for one in (2.0, 1.0 if better else 3.0)
     )
-    found, again = (
-        SimpleNamespace(motion=lambda one=one, **_: one, about=lambda _: None) for one in (first, second)
+    again = SimpleNamespace(motion=lambda **_: second)
+    found = SimpleNamespace(
+        motion=lambda **_: first,
+        about=lambda _: None,
+        best=(SimpleNamespace(model=None), None),
+        stack=SimpleNamespace(centers=truth),
+        without=lambda modes: None if anew else again,
     )
-    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again, PIXEL)
+    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again if anew else None, PIXEL)
     assert chosen is (again if better else found)
     assert bool(taken.info.warnings) == better

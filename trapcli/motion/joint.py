@@ -49,6 +49,7 @@ from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
 
 _FEWEST = 12  # frames
 _LINE_BAND = 8.0  # band times radius for common lines
@@ -101,8 +102,8 @@ class Found:
     ----------
     stack:
         What is known of the frames.
-    low:
-        Means over groups of frames to which the motion is fitted.
+    pace:
+        Roughly the rotation from frame to frame [rad]; 0 where nothing changes.
     best:
         The motion and what is known of it; None where nothing changes.
     bands:
@@ -112,7 +113,7 @@ class Found:
     """
 
     stack: Stack
-    low: LowBand
+    pace: float
     best: tuple[Fit, Assessment] | None
     bands: tuple[float, float]
     knots: int
@@ -134,12 +135,27 @@ class Found:
         """Return the low modes of all frames about other centres, ``(N, 2)`` [length]."""
         return self.stack.low.shifted(center - self.stack.centers.center)
 
+    def without(self, pattern: ComplexArray) -> Found | None:
+        """Return where this motion leads to without ``(N, K)`` modes in the frames, if that explains them."""
+        if self.best is None:
+            return None
+        fit, time = self.best[0], self.stack.low.time
+        stack = replace(self.stack, low=replace(self.stack.low, modes=self.stack.low.modes - pattern))
+        low = _fine_groups(stack, self.pace)
+        (coarse,) = _coarse_fits([fit.path.ascending()], low, time, fit.model.band, self.knots)
+        model = ObjectModel.likeliest(low, fit.model.band, coarse.R)
+        best = _fine_fit(coarse, model, smooth=not self.knots)
+        if not _settled(*best, len(time)):
+            return None
+        stack, best = _quieter(stack, self.pace, *best)
+        return replace(self, stack=stack, best=best)
+
     def refined(self) -> Found:
         """Return the likeliest motion near this one, with an object that has its sharp edges."""
         if self.best is None:
             return self
-        time, finest = self.stack.low.time, self.bands[1]
-        return replace(self, best=_refined(self.low, *self.best, time, finest, self.knots))
+        low, time = _fine_groups(self.stack, self.pace), self.stack.low.time
+        return replace(self, best=_refined(low, *self.best, time, self.bands[1], self.knots))
 
 
 def find_motion(
@@ -148,7 +164,6 @@ def find_motion(
     *,
     time: Array,
     pixel_size: float = 1.0,
-    near: Found | None = None,
     progress: Progress | None = None,
 ) -> Found:
     """Find the motion from all frames at once.
@@ -163,9 +178,6 @@ def find_motion(
         ``(N,)`` ascending times.
     pixel_size:
         Edge of a pixel [length].
-    near:
-        What was found in much the same frames: where that leads to a motion that explains these, no other is
-        sought.
     progress:
         Called as ``progress(stage, done, total)``.
 
@@ -197,17 +209,14 @@ def find_motion(
     outlying = np.zeros(len(time), bool)
     outlying[seen] = _outliers(low.select(np.flatnonzero(seen)))
     stack = Stack(reduced, low, centers, seen, outlying, attenuation.index)
-    used = np.flatnonzero(seen & ~outlying)
+    used = stack.used
     pace = _turn_per_frame(reduced.samples[used], reduced.noise)
     bands = (config.band, config.band) if config.band else _bands(low.select(used))
     if pace == 0.0:
-        return Found(stack, low, None, bands, config.knots)
-    best = (
-        None if near is None else _nearby(_fine_groups(stack, used, pace), time, bands[0], config.knots, near)
-    )
-    fit, assessment = best or _best_motion(stack, used, pace, bands[0], config.knots, progress)
-    stack, fit, assessment = _quieter(stack, used, pace, fit, assessment)
-    return Found(stack, _fine_groups(stack, used, pace), (fit, assessment), bands, config.knots)
+        return Found(stack, pace, None, bands, config.knots)
+    best = _best_motion(stack, pace, bands[0], config.knots, progress)
+    stack, best = _quieter(stack, pace, *best)
+    return Found(stack, pace, best, bands, config.knots)
 
 
 def _bands(low: LowBand) -> tuple[float, float]:
@@ -228,29 +237,15 @@ def _bands(low: LowBand) -> tuple[float, float]:
     return first / low.radius, (last if finer else first) / low.radius
 
 
-def _nearby(low: LowBand, time: Array, band: float, knots: int, near: Found) -> tuple[Fit, Assessment] | None:
-    """Return the motion that one found before leads to, if that is as good as one that is sought."""
-    if near.best is None:
-        return None
-    (coarse,) = _coarse_fits([near.best[0].path.ascending()], low, time, band, knots)
-    best = _fine_fit(coarse, ObjectModel.likeliest(low, band, coarse.R), smooth=not knots)
-    return best if _settled(*best, len(time)) else None
-
-
 def _best_motion(
-    stack: Stack,
-    used: NDArray[np.intp],
-    pace: float,
-    band: float,
-    knots: int,
-    progress: Progress | None,
+    stack: Stack, pace: float, band: float, knots: int, progress: Progress | None
 ) -> tuple[Fit, Assessment]:
     """Return the motion that explains the frames best, of all hypotheses that are worth a look."""
-    low = _fine_groups(stack, used, pace)
+    low = _fine_groups(stack, pace)
     coarse: list[Fit] = []
     tried: list[Fit] = []
     best: tuple[Fit, Assessment] | None = None
-    for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, used, pace, progress), strict=False):
+    for most, hypotheses in zip(_MOST_REFINED, _hypotheses(stack, pace, progress), strict=False):
         # a coarse model of the object tells right from wrong far better than lines and moments do
         coarse += _coarse_fits([h.path for h in hypotheses], low, stack.low.time, band, knots)
         rivals = distinct(coarse, most)
@@ -267,18 +262,18 @@ def _best_motion(
 
 
 def _quieter(
-    stack: Stack, used: NDArray[np.intp], pace: float, fit: Fit, assessment: Assessment
-) -> tuple[Stack, Fit, Assessment]:
+    stack: Stack, pace: float, fit: Fit, assessment: Assessment
+) -> tuple[Stack, tuple[Fit, Assessment]]:
     """Lower the noise to what the motion leaves over: sharp edges that move pass for noise.
 
     Too much of it would hide a wrong motion's misfit, and makes motions look better that see less.
     """
     share = max(fit.cost / assessment.degrees, _LEAST_SHARE)
     if share >= 1 - NOISE_ERROR:
-        return stack, fit, assessment
+        return stack, (fit, assessment)
     stack = replace(stack, low=replace(stack.low, variance=share * stack.low.variance))
-    low = _fine_groups(stack, used, pace)
-    return stack, *refitted(low, fit, fit.path)
+    low = _fine_groups(stack, pace)
+    return stack, refitted(low, fit, fit.path)
 
 
 def _refined(
@@ -404,28 +399,27 @@ def _turn_per_frame(samples: NDArray[np.complexfloating], noise: float) -> float
     return float(max(within, overall) / lags[first])
 
 
-def _grouped(stack: Stack, used: NDArray[np.intp], size: int) -> tuple[ReducedMap, LowBand]:
+def _grouped(stack: Stack, size: int) -> tuple[ReducedMap, LowBand]:
     """Return means over groups of `size` consecutive used frames."""
+    used = stack.used
     low = stack.low.select(used).grouped(size)
     mean = group_means(stack.reduced.samples[used], len(low.time))
     noise = stack.reduced.noise * np.sqrt(len(low.time) / len(used))
     return replace(stack.reduced, samples=mean, time=low.time, noise=noise), low
 
 
-def _fine_groups(stack: Stack, used: NDArray[np.intp], pace: float) -> LowBand:
+def _fine_groups(stack: Stack, pace: float) -> LowBand:
     """Return means over groups of frames within which the object turns too little to see it in the noise."""
     fine = _FINE_GROUP * float(np.clip(np.sqrt(_relative_noise(stack) / 0.01), 0.3, 2.0))
-    size = max(1, min(int(fine / pace), len(used) // _FEWEST_GROUPS))
-    return _grouped(stack, used, size)[1]
+    size = max(1, min(int(fine / pace), len(stack.used) // _FEWEST_GROUPS))
+    return _grouped(stack, size)[1]
 
 
-def _hypotheses(
-    stack: Stack, used: NDArray[np.intp], pace: float, progress: Progress | None
-) -> Iterator[list[Hypothesis]]:
+def _hypotheses(stack: Stack, pace: float, progress: Progress | None) -> Iterator[list[Hypothesis]]:
     """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
-    size = max(1, min(int(_LINE_GROUP / pace), len(used) // _FEWEST_GROUPS))
-    reduced, low = _grouped(stack, used, size)
-    centring = float(np.median(stack.centers.errors[used])) / np.sqrt(size)
+    size = max(1, min(int(_LINE_GROUP / pace), len(stack.used) // _FEWEST_GROUPS))
+    reduced, low = _grouped(stack, size)
+    centring = float(np.median(stack.centers.errors[stack.used])) / np.sqrt(size)
     lines = LineTable(reduced, _LINE_ERROR, centring)
     evidence = Evidence(low.time, lines, MomentTable(low, _MOMENT_ERROR))
     found: list[Hypothesis] = []

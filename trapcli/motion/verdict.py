@@ -59,6 +59,11 @@ class Stack:
     outlying: Bools
     frame: NDArray[np.int64]
 
+    @property
+    def used(self) -> NDArray[np.intp]:
+        """Which frames tell the motion."""
+        return np.flatnonzero(self.seen & ~self.outlying)
+
 
 @dataclass(frozen=True)
 class Verdict:

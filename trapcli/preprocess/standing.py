@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trapcli.motion import triangular
 from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import ObjectModel
@@ -39,9 +40,9 @@ _GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
 _FEWEST_GROUPS = 30
 _KNOTS = np.deg2rad(6.0)  # rotation per interval of the spline that bends the motion
 _FEWEST_KNOTS = 12
-_STEPS = 2  # of fitting the motion, each time
+_STEPS = 1  # of fitting the motion, each time
 _ROUNDS = 4  # of fitting one after the other
-_SETTLED = 0.03  # change of the pattern, as a share of it, that ends them
+_SETTLED = 0.1  # change of the pattern, as a share of it, that ends them
 _VARIANCES = np.geomspace(1e-3, 1e7, 100)  # of the points, in units of what is told best
 _SIFTINGS = 40  # of the points
 _LEAST_TOLD = 1e-3  # share of a point's variance that the frames are taken to tell at least
@@ -49,9 +50,7 @@ _NEGLIGIBLE = 1e-6  # variance of a point, as a share of the typical, that is as
 _CONVINCING = 5.0  # natural logarithm of the odds at which there is a pattern
 
 
-def find_standing_pattern(
-    low: LowBand, motion: Motion, shape: tuple[int, ...], pixel_size: float
-) -> Array | None:
+def find_standing_pattern(low: LowBand, motion: Motion, model: ObjectModel) -> StandingPattern | None:
     """Find what stays in place while the particle moves.
 
     Parameters
@@ -59,17 +58,15 @@ def find_standing_pattern(
     low:
         Modes of N attenuation projections about the centres of the motion.
     motion:
-        Of the particle in them, roughly; centres in units of `pixel_size`.
-    shape:
-        H and W of the projections.
-    pixel_size:
-        Edge of a pixel [length].
+        Of the particle in them, roughly.
+    model:
+        Of the object in them: how fine its lattice is, and what the object may be like.
 
     Returns
     -------
-    ndarray
-        ``(H, W)`` attenuation to be taken off every frame, at the low spatial frequencies that tell the
-        motion; None where nothing stays, or where the motion isn't known.
+    StandingPattern
+        At the low spatial frequencies that tell the motion; None where nothing stays, or where the motion
+        isn't known.
     """
     known = np.flatnonzero(np.isfinite(motion.R[:, 0, 0]) & np.isfinite(motion.center[:, 0]))
     if len(known) < _FEWEST_GROUPS:
@@ -86,20 +83,38 @@ def find_standing_pattern(
     path = path.near(spline, np.concatenate([spline.grid, views.low.time]))
     middle = np.median(center, axis=0)
     points = _Points.over(views.low, middle, _BAND)
-    odds, values = _pattern(views, path, points)
+    odds, values = _pattern(views, path, points, model)
     if odds < _CONVINCING:
         return None
     for _ in range(_ROUNDS):
-        model = ObjectModel(views.without(points.waves @ values), _BAND / low.radius)
-        fit = model.fit(path, views.low.time, spline, steps=_STEPS)
+        cleared = ObjectModel(
+            views.without(points.waves @ values), _BAND / low.radius, guard=model.guard, prior=model.prior
+        )
+        fit = cleared.fit(path, views.low.time, spline, steps=_STEPS)
         path, before = fit.path, values
-        _, values = _pattern(views.shifted(fit.shift), path, points)
+        _, values = _pattern(views.shifted(fit.shift), path, points, model)
         change = np.linalg.norm(points.waves @ (values - before))
         if change < _SETTLED * np.linalg.norm(points.waves @ values):
             break
     points = _Points.over(low, middle, _FINEST_BAND)
-    _, values = _pattern(finest.shifted(fit.shift), path, points)
-    return points.image(values, shape, pixel_size)
+    _, values = _pattern(finest.shifted(fit.shift), path, points, model)
+    return StandingPattern(points, values)
+
+
+@dataclass(frozen=True)
+class StandingPattern:
+    """Attenuation that is to be taken off every frame."""
+
+    points: _Points
+    values: Array
+
+    def image(self, shape: tuple[int, ...], pixel_size: float) -> Array:
+        """Return it in frames of H and W pixels, ``(H, W)``."""
+        return self.points.image(self.values, shape, pixel_size)
+
+    def modes(self, center: Array) -> ComplexArray:
+        """Return its ``(N, K)`` low modes about ``(N, 2)`` centres [length]."""
+        return np.asarray(np.exp(1j * center @ self.points.k.T) * (self.points.waves @ self.values))
 
 
 def without(frames: Frames, pattern: Array) -> Frames:
@@ -194,9 +209,9 @@ class _Points:
         return np.asarray(np.where(near, image, 0.0))
 
 
-def _pattern(views: _Views, path: Path, points: _Points) -> tuple[float, Array]:
+def _pattern(views: _Views, path: Path, points: _Points, model: ObjectModel) -> tuple[float, Array]:
     """Return the logarithm of the odds that there is a pattern, and the ``(P,)`` values of its points."""
-    told = _without_object(views, path.R[-len(views.phase) :], points)
+    told = _without_object(views, path.R[-len(views.phase) :], points, model)
     # where the motion or the model is wrong, what is left over is no pattern for that alone
     misfit = (told.square - told.likeliest().gain) / told.degrees
     told = told.doubted(max(1.0, misfit))
@@ -253,14 +268,14 @@ class _Told:
         """Return values and squared errors of points with prior variances."""
         root = np.sqrt(variances)
         scaled = root[:, None] * self.curvature * root + np.eye(len(root))
-        covariance = root[:, None] * np.linalg.inv(scaled) * root
-        return covariance @ self.pull, np.diagonal(covariance)
+        half = triangular.inverse_factor(scaled.T) * root
+        return half.T @ (half @ self.pull), np.sum(half**2, axis=0)
 
 
-def _without_object(views: _Views, R: Array, points: _Points) -> _Told:
+def _without_object(views: _Views, R: Array, points: _Points, model: ObjectModel) -> _Told:
     """Eliminate the object."""
     low = views.low
-    model = ObjectModel(low, points.band / low.radius)
+    model = ObjectModel(low, points.band / low.radius, guard=model.guard, prior=model.prior)
     seen = model.views(R)
     root = np.sqrt(conjugate_share(low.k) / low.variance)
     phase, modes = root * views.phase, root * low.modes
