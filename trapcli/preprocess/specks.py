@@ -28,8 +28,10 @@ _ROUND = 0.3  # least ratio of a speck's curvatures
 _SEEN = 4.0  # standard errors by which a candidate stands out
 _SURE = 6.0  # standard errors of the depth of a speck
 _FAINTEST = 0.005  # depth of a speck
-_STEADY = 15.0  # the same for its depth in parts of the stack
-_VERY_STEADY = 100.0  # where the particle drifts too little to tell what drifts with it
+_STEADY = ((3.5, 15.0), (2.0, 40.0), (1.0, 60.0), (-1.0, 100.0))
+"""Pairs: how clearly a speck explains the frames better in its place than drifting with the particle, at least;
+standard errors by which its depth must then stand out of how that varies between parts of the stack."""
+
 _SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
 _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
 _DEEPEST = 0.98
@@ -40,6 +42,7 @@ MARGIN = _REACH + _NEAR
 """Distance from what is hidden up to which pixels tell of its specks [pixels]."""
 
 _OTHERS = 6.0  # radius in which pixels belong to another candidate [pixels]
+_APART = 1.0  # least distance of two specks [pixels]
 _MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
 _ROUNDS = 3  # of looking for more
 _NOTHING = 1e-30  # square of a spot that isn't there
@@ -106,7 +109,7 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
         found = False
         places = _candidates(standing, render(specks, shape), reach & ~refused)
         for place in places:
-            if any(np.hypot(*(speck[:2] - place)) < 1.0 for speck in specks):
+            if any(np.hypot(*(speck[:2] - place)) < _APART for speck in specks):
                 continue
             near = [k for k, speck in enumerate(specks) if np.hypot(*(speck[:2] - place)) < _TOGETHER]
             fitted = _fit(standing, place, specks, near, places)
@@ -278,7 +281,7 @@ class _Window:
 
 
 def _fit(
-    standing: Standing, place: Array, specks: list[Array], near: list[int], places: Array
+    standing: Standing, place: Array, specks: list[Array], near: list[int], places: Array, moves: int = 1
 ) -> list[Array] | None:
     """Return a speck at `place` and those `near` it, fitted together; None where there is none."""
     shape = standing.image.shape
@@ -303,7 +306,11 @@ def _fit(
     error = np.sqrt(np.linalg.pinv(found.jac.T @ found.jac)[3, 3]) * scatter
     size, depth = fitted[0][2:]
     moved = np.abs(fitted[0][:2] - place).max() > 0.99 * _MOVES
-    if moved or abs(depth) < max(_FAINTEST, _SURE * error) or size > 0.95 * _MOST_SIZE:
+    further = np.rint(fitted[0][:2])
+    if moved and moves > 0 and (further >= 0).all() and (further < shape).all():
+        return _fit(standing, further, specks, near, places, moves - 1)
+    doubled = any(np.hypot(*(fitted[0][:2] - other[:2])) < _APART for other in (*known, *fitted[1:]))
+    if moved or doubled or abs(depth) < max(_FAINTEST, _SURE * error) or size > 0.95 * _MOST_SIZE:
         return None
     series = series - window.profiles(found.x.reshape(-1, 4)[1:])[:, None]
     along = [_profile(*window.places, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
@@ -323,7 +330,7 @@ def _stays(series: Array, here: Array, along: Array) -> bool:
     """
     shares, in_place = _explained(series, here)
     gain = _clarity(in_place - _explained(series, along)[1])
-    return _clarity(shares) > (_STEADY if gain > 3 else _VERY_STEADY if gain > -1 else np.inf)
+    return _clarity(shares) > next((least for bound, least in _STEADY if gain > bound), np.inf)
 
 
 def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
@@ -336,7 +343,7 @@ def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
 
 
 def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> Array:
-    """Return the Cholesky factor of the covariance of the mean projection, its noise, and any plane."""
+    """Return the Cholesky factor of the covariance of the mean projection, its noise, and any paraboloid."""
     frames = np.nan_to_num(standing.frames[:, rows, columns])
     height, width = frames.shape[1:]
     taper = np.multiply.outer(*(np.hanning(size + 2)[1:-1] for size in (height, width)))
@@ -346,6 +353,7 @@ def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: B
     x2, x1 = (axis[keep] for axis in np.mgrid[:height, :width])
     covariance = by_lag[x2[:, None] - x2, x1[:, None] - x1] / _INDEPENDENT
     covariance[np.diag_indices_from(covariance)] += standing.error**2 + 1e-10
-    plane = np.stack([np.ones(len(x1)), (x1 - x1.mean()) / width, (x2 - x2.mean()) / height], axis=1)
-    covariance += plane @ plane.T
+    right, down = (x1 - x1.mean()) / width, (x2 - x2.mean()) / height
+    smooth = np.stack([np.ones(len(x1)), right, down, right**2, down**2, right * down], axis=1)
+    covariance += smooth @ smooth.T
     return np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False))
