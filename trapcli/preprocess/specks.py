@@ -29,8 +29,8 @@ _SEEN = 4.0  # standard errors by which a candidate stands out
 _SURE = 6.0  # standard errors of the depth of a speck
 _FAINTEST = 0.005  # depth of a speck
 _STEADY = ((3.5, 15.0), (2.0, 40.0), (1.0, 60.0), (-1.0, 100.0))
-"""Pairs: how clearly a speck explains the frames better in its place than drifting with the particle, at least;
-standard errors by which its depth must then stand out of how that varies between parts of the stack."""
+"""How clearly a speck explains frames better in its place than drifting with the particle, at least;
+standard errors by which its depth must then stand out of how it varies between parts of the stack."""
 
 _SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
 _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
