@@ -233,6 +233,18 @@ def test_the_finest_fit_must_explain_the_images_as_well(misfit: float, taken: bo
     assert joint._as_well(fine, fine, coarse, coarse) == taken  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("worse", [0.0, 0.2])
+def test_a_motion_that_is_wrong_in_a_quarter_of_the_stack_does_not_end_the_search(worse: float) -> None:
+    """The misfit of all frames together may still look like noise."""
+    rng = np.random.default_rng(3)
+    modes = 200
+    misfit = rng.chisquare(modes, 200) / modes
+    misfit[:50] *= 1 + worse
+    assert misfit.mean() < 1.05 + 0.01
+    assessment = SimpleNamespace(frame_misfit=misfit, degrees=200.0 * modes)
+    assert joint._even(assessment) == (worse == 0)  # type: ignore[arg-type]
+
+
 def test_too_few_frames() -> None:
     images, truth = render("tumbling", "blobs", seed=1, frames=8)
     with pytest.raises(InputError, match="at least 12 are needed"):

@@ -7,6 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from trapcli.preprocess import specks
 from trapcli.preprocess.counts import Counts, Sample
 from trapcli.preprocess.surface import EmptyField, median_field
 from trapcli.preprocess.surface import fit_empty_field as fit_to_sample
@@ -102,6 +103,31 @@ def test_specks_close_together_are_told_apart() -> None:
     found = fit_empty_field(stack(field))
     assert found.specks == 3
     assert np.abs(deviation(found.log_light, field)).max() < 0.07
+
+
+def test_a_fit_follows_a_speck_that_lies_further_than_it_looked() -> None:
+    noise = NOISE * np.random.default_rng(5).standard_normal((FRAMES, SIZE, SIZE))
+    standing = specks.Standing.of((speck(4, -3) + noise).astype(np.float32), NOISE)
+    place = np.array([4.0, -3.0]) + SIZE // 2
+    off = place + np.array([0.0, 3.0])
+    found = specks._fit(standing, off, [], [], off[None])
+    assert found is not None
+    np.testing.assert_allclose(found[0], [*place, 1.5, 0.4], atol=0.02)
+    # where there is one already, there is no other
+    assert specks._fit(standing, off, found, [0], off[None]) is None
+
+
+def test_a_speck_under_a_round_particle_whose_mean_is_a_dome() -> None:
+    """What turns is round: its mean in time is as curved as each frame is, and varies little."""
+    turn = np.linspace(0, 3 * np.pi, FRAMES)[:, None, None]
+    dome = np.sqrt(np.maximum(1 - (ROWS**2 + COLUMNS**2) / 20**2, 0))
+    inside = ((ROWS - 9 * np.sin(turn)) ** 2 + (COLUMNS - 9 * np.cos(turn)) ** 2) / 3**2
+    frames = uneven() - 0.4 * dome - 0.1 * np.sqrt(np.maximum(1 - inside, 0))
+    hidden = speck(2, -10, size=2.4, depth=0.45)
+    noisy = frames + hidden + NOISE * np.random.default_rng(4).standard_normal(frames.shape)
+    found = fit_empty_field(noisy.astype(np.float32))
+    assert found.specks == 1
+    assert np.abs(deviation(found.log_light, uneven() + hidden)).max() < 0.25 * np.abs(hidden).max()
 
 
 def test_what_drifts_with_the_particle_is_no_speck() -> None:
