@@ -30,6 +30,7 @@ from trapcli.stack.source import calibrated
 
 if TYPE_CHECKING:  # each method is imported only when it is used
     from trapcli.motion.joint import Found
+    from trapcli.preprocess.standing import StandingPattern
 
 Progress = Callable[[str, int, int], None]
 
@@ -150,22 +151,39 @@ def _without_dust(
     projections: Frames, found: Found, find: Callable[[Frames], Found], pixel_size: float
 ) -> tuple[Frames, Found]:
     """Take off what stays in place under the particle, if that explains the images better."""
-    from trapcli.preprocess.standing import find_standing_pattern, without
+    from trapcli.preprocess.standing import find_standing_pattern, most_likely, without
 
     if found.best is None:
         return projections, found
-    motion, (fit, _) = found.motion(hidden=False), found.best
-    pattern = find_standing_pattern(found.about(motion.center), motion, fit.model)
-    if pattern is None:
-        return projections, found
-    cleared = without(projections, pattern.image(projections.shape[1:], pixel_size))
-    # where the motion found before explains no more than it did, another one may
-    found_again = found.without(pattern.modes(found.stack.centers.center)) or find(cleared)
-    again = found_again.motion(hidden=False)
+    motion, (fit, _), stack = found.motion(hidden=False), found.best, found.stack
+    center, best, cleared = stack.centers.center, (projections, found), projections
+
+    def less(pattern: StandingPattern) -> Frames:
+        return without(projections, pattern.image(projections.shape[1:], pixel_size))
+
+    pattern = find_standing_pattern(found.about(motion.center), motion.center, motion.R, fit.model)
+    if pattern is not None:
+        cleared = less(pattern)
+        best = _better(best, (cleared, found.without(pattern.modes(center))))
+    if best[1].explains:
+        return best
+    # so much may stay in place that it hides the motion
+    low, centers = stack.low.select(stack.used), center[stack.used]
+    path = most_likely(low, centers, found.despite_standing())
+    hidden = find_standing_pattern(low, centers, path.R)
+    if hidden is not None:
+        best = _better(best, (less(hidden), found.without(hidden.modes(center), path)))
+    if pattern is not None and not best[1].explains:
+        best = _better(best, (cleared, find(cleared)))
+    return best
+
+
+def _better(best: tuple[Frames, Found], other: tuple[Frames, Found]) -> tuple[Frames, Found]:
+    """Return the other one if it explains the images better and can be trusted as well."""
+    motion, again = (one[1].motion(hidden=False) for one in (best, other))
     both = np.isfinite(motion.residual) & np.isfinite(again.residual)
     better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False
-    better = better and again.identifiable >= motion.identifiable
-    return (cleared, found_again) if better else (projections, found)
+    return other if better and again.identifiable >= motion.identifiable else best
 
 
 def _from_array(frames: Any) -> Frames:

@@ -15,7 +15,6 @@ from trapcli import pipeline
 from trapcli.motion import joint
 from trapcli.motion.front_end import read_front_end
 from trapcli.motion.low_band import read_low_band
-from trapcli.motion.object_model import ObjectModel
 from trapcli.preprocess import standing
 from trapcli.preprocess.standing import StandingPattern, find_standing_pattern, without
 from trapcli.result.motion import Motion
@@ -48,7 +47,7 @@ def pattern_in(frames: np.ndarray, motion: Motion) -> StandingPattern | None:
         Frames.from_array(frames), time=motion.time, pixel_size=PIXEL, line_band=1.0, fine_band=28.0
     )
     low = front.low.shifted(motion.center - front.centers.center)
-    return find_standing_pattern(low, motion, ObjectModel(low, 22.0 / low.radius))
+    return find_standing_pattern(low, motion.center, motion.R)
 
 
 def test_where_nothing_stays_nothing_is_found(turning: tuple[np.ndarray, Motion]) -> None:
@@ -109,25 +108,46 @@ def test_a_pattern_is_taken_off_every_frame(turning: tuple[np.ndarray, Motion]) 
     assert np.array_equal(next(cleared.pick(np.array([7]))), cleared.to_array()[7])
 
 
+def found_by(motion: Motion, *, residual: float, explains: bool) -> SimpleNamespace:
+    """Return what `pipeline` asks of a motion that was found."""
+    told = replace(motion, residual=np.full(len(motion), residual))
+    low = SimpleNamespace(select=lambda _: None)
+    return SimpleNamespace(
+        motion=lambda **_: told,
+        about=lambda _: None,
+        best=(SimpleNamespace(model=None), None),
+        stack=SimpleNamespace(centers=motion, low=low, used=np.arange(len(motion))),
+        explains=explains,
+        despite_standing=list,
+    )
+
+
 @pytest.mark.parametrize("better", [True, False])
-@pytest.mark.parametrize("anew", [True, False])
 def test_a_pattern_counts_only_where_it_explains_the_images(
-    better: bool, anew: bool, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
+    better: bool, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
     pattern = SimpleNamespace(image=lambda *_: specks(1.0), modes=lambda center: center)
     monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: pattern)
-    first, second = (
-        replace(truth, residual=np.full(len(truth), one)) for one in (2.0, 1.0 if better else 3.0)
-    )
-    again = SimpleNamespace(motion=lambda **_: second)
-    found = SimpleNamespace(
-        motion=lambda **_: first,
-        about=lambda _: None,
-        best=(SimpleNamespace(model=None), None),
-        stack=SimpleNamespace(centers=truth),
-        without=lambda modes: None if anew else again,
-    )
-    taken, chosen = pipeline._without_dust(frames, found, lambda *_: again if anew else None, PIXEL)
+    found = found_by(truth, residual=2.0, explains=True)
+    again = found_by(truth, residual=1.0 if better else 3.0, explains=True)
+    found.without = lambda *_: again
+    taken, chosen = pipeline._without_dust(frames, found, lambda _: None, PIXEL)
     assert chosen is (again if better else found)
     assert bool(taken.info.warnings) == better
+
+
+@pytest.mark.parametrize("best", [0, 1, 2, 3])
+def test_where_nothing_explains_the_images_the_best_of_all_is_taken(
+    best: int, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
+    pattern = SimpleNamespace(image=lambda *_: specks(1.0), modes=lambda center: center)
+    monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: pattern)
+    monkeypatch.setattr("trapcli.preprocess.standing.most_likely", lambda *_: truth)
+    residuals = [3.0, 4.0, 5.0, 6.0]
+    residuals[best] = 2.0
+    found, again, hidden, anew = (found_by(truth, residual=one, explains=False) for one in residuals)
+    found.without = lambda _, path=None: again if path is None else hidden
+    _, chosen = pipeline._without_dust(frames, found, lambda _: anew, PIXEL)
+    assert chosen is (found, again, hidden, anew)[best]

@@ -63,6 +63,7 @@ _LINE_GROUP = np.deg2rad(2.0)  # rotation over a group of frames that are averag
 _FINE_GROUP = np.deg2rad(1.0)  # the same, to refine it, at noise of 1 % of the peak
 _FEWEST_GROUPS = 30
 _LINE_ERROR = 0.01  # model error of the lines, as a share of the map
+_STANDING_ERROR = 0.03  # the same where something stays in place
 _MOMENT_ERROR = 0.002  # model error of the moments, as a share of their size
 _ATTEMPTS = (
     (50, 0.5),
@@ -77,6 +78,7 @@ _LIKELY = 1.3  # cost, in units of the best's, up to which a hypothesis is looke
 _MOST_HYPOTHESES = 2, 16  # of them at most, of the first window that fits and of all
 _RIVAL = 1.1  # misfit of a coarse model, in units of the best's, up to which a fine one is fitted as well
 _MOST_REFINED = 2, 4  # of them at most
+_MOST_DESPITE = 6  # of hypotheses despite what stays in place
 _FIRST_STEPS = 6  # of the first fit: a motion that is not found by then is none
 _COARSE_KNOTS = np.deg2rad(24.0)  # rotation per interval of the spline that comes first
 _FINE_KNOTS = np.deg2rad(6.0)  # the same in the end, where roughness of ω is weighed against the misfit
@@ -137,20 +139,39 @@ class Found:
         """Return the low modes of all frames about other centres, ``(N, 2)`` [length]."""
         return self.stack.low.shifted(center - self.stack.centers.center)
 
-    def without(self, pattern: ComplexArray) -> Found | None:
-        """Return where this motion leads to without ``(N, K)`` modes in the frames, if that explains them."""
+    @property
+    def settled(self) -> bool:
+        """Whether the motion explains all the images and is told so well that no other need be tried."""
+        return self.best is not None and _settled(*self.best, len(self.stack.low.time))
+
+    @property
+    def explains(self) -> bool:
+        """Whether noise alone explains what the motion leaves, in all parts of the stack alike."""
+        return self.best is not None and certified(*self.best) and _even(self.best[1])
+
+    def without(self, pattern: ComplexArray, path: Path | None = None) -> Found:
+        """Return where a path, or else this motion's, leads to without ``(N, K)`` modes in the frames."""
         if self.best is None:
-            return None
-        fit, time = self.best[0], self.stack.low.time
+            return self
+        (fit, _), time = self.best, self.stack.low.time
         stack = replace(self.stack, low=replace(self.stack.low, modes=self.stack.low.modes - pattern))
         low = _fine_groups(stack, self.pace)
-        (coarse,) = _coarse_fits([fit.path.ascending()], low, time, fit.model.band, self.knots)
+        start = (path or fit.path).ascending()
+        (coarse,) = _coarse_fits([start], low, time, fit.model.band, self.knots)
         model = ObjectModel.likeliest(low, fit.model.band, coarse.R)
         best = _fine_fit(coarse, model, smooth=not self.knots)
-        if not _settled(*best, len(time)):
-            return None
         stack, best = _quieter(stack, self.pace, *best)
         return replace(self, stack=stack, best=best)
+
+    def despite_standing(self) -> list[Path]:
+        """Return paths of motions that lines and moments allow where something stays in place."""
+        evidence, turn = _evidence(self.stack, self.pace, standing=True)
+        found: list[Hypothesis] = []
+        for attempt, (window, middle) in enumerate(_ATTEMPTS):
+            tried = replace(evidence, seed=attempt)
+            branches = find_branches(tried, window=window, middle=middle, turn=turn)
+            found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_DESPITE)
+        return [h.path for h in found]
 
     def refined(self) -> Found:
         """Return the likeliest motion near this one, with an object that has its sharp edges."""
@@ -425,22 +446,32 @@ def _fine_groups(stack: Stack, pace: float) -> LowBand:
     return _grouped(stack, size)[1]
 
 
-def _hypotheses(stack: Stack, pace: float, progress: Progress | None) -> Iterator[list[Hypothesis]]:
-    """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
+def _evidence(stack: Stack, pace: float, *, standing: bool = False) -> tuple[Evidence, float]:
+    """Return what lines and moments of groups of frames tell, and roughly the turn between groups [rad].
+
+    What is `standing` under the particle adds to moments what is linear in where the centre is, at first
+    order: they are freed of it. It adds the same to lines that lie alike: they are believed less.
+    """
     size = max(1, min(int(_LINE_GROUP / pace), len(stack.used) // _FEWEST_GROUPS))
     reduced, low = _grouped(stack, size)
     centring = float(np.median(stack.centers.errors[stack.used])) / np.sqrt(size)
-    lines = LineTable(reduced, _LINE_ERROR, centring)
-    evidence = Evidence(low.time, lines, MomentTable(low, _MOMENT_ERROR))
+    lines = LineTable(reduced, _STANDING_ERROR if standing else _LINE_ERROR, centring)
+    series = _linear(group_means(stack.centers.center[stack.used], len(low.time))) if standing else None
+    return Evidence(low.time, lines, MomentTable(low, _MOMENT_ERROR, series)), size * pace
+
+
+def _hypotheses(stack: Stack, pace: float, progress: Progress | None) -> Iterator[list[Hypothesis]]:
+    """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
+    evidence, turn = _evidence(stack, pace)
     found: list[Hypothesis] = []
     yielded: list[Hypothesis] = []
     for attempt, (window, middle) in enumerate(_ATTEMPTS):
         last, tried = attempt == len(_ATTEMPTS) - 1, replace(evidence, seed=attempt)
-        branches = find_branches(tried, window=window, middle=middle, turn=size * pace, progress=progress)
+        branches = find_branches(tried, window=window, middle=middle, turn=turn, progress=progress)
         found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_HYPOTHESES[1])
         fits = found[0].lines < _FITS and found[0].moments < _FITS
         if last:
-            again = [turned_back(evidence, h, size * pace) for h in found[:_TURNED_BACK]]
+            again = [turned_back(evidence, h, turn) for h in found[:_TURNED_BACK]]
             found = distinct([*again, *found], _MOST_HYPOTHESES[1])
         if last or (fits and not yielded):
             most = _MOST_HYPOTHESES[1 if yielded else 0]
@@ -449,6 +480,12 @@ def _hypotheses(stack: Stack, pace: float, progress: Progress | None) -> Iterato
             yielded += new
             if new:
                 yield new
+
+
+def _linear(center: Array) -> Array:
+    """Return ``(G, 3)`` what depends on ``(G, 2)`` centres linearly: 1 and both, of unit size."""
+    way = center - center.mean(axis=0)
+    return np.column_stack([np.ones(len(way)), way / (np.sqrt(np.mean(way**2)) + 1e-300)])
 
 
 def _coarse_fits(paths: list[Path], low: LowBand, time: Array, band: float, knots: int) -> list[Fit]:

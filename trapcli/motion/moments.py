@@ -59,14 +59,16 @@ class MomentTable:
     model_error:
         Error of the moments besides pixel noise, as a share of their size: mass, background and centring that
         drift.
+    standing:
+        ``(G, S)`` series of which each component may hold any share, and the object doesn't; None for none.
     """
 
-    def __init__(self, low: LowBand, model_error: float) -> None:
+    def __init__(self, low: LowBand, model_error: float, standing: Array | None = None) -> None:
         second_size = float(np.abs(low.second).mean())
         third_size = float(np.sqrt(np.mean(low.third**2))) + 0.5 * second_size
         self._orders = [
-            _Order.create(2, low.second, low.second_covariance, model_error * second_size),
-            _Order.create(3, low.third, low.third_covariance, model_error * third_size),
+            _Order.create(2, low.second, low.second_covariance, model_error * second_size, standing),
+            _Order.create(3, low.third, low.third_covariance, model_error * third_size, standing),
         ]
 
     def select(self, start: int, stop: int) -> MomentTable:
@@ -98,6 +100,8 @@ class _Order:
         ``(3ⁿ, 3 · C)`` whitened change of what the images show of a tensor in lab coordinates by ε.
     whitening, values:
         ``(C, C)``; ``(G, C)`` whitened moments.
+    standing:
+        ``(G, C, V)`` whitened design of V unknowns that are no part of the object.
     """
 
     components: NDArray[np.intp]
@@ -105,9 +109,12 @@ class _Order:
     turning: Array
     whitening: Array
     values: Array
+    standing: Array
 
     @classmethod
-    def create(cls, order: int, moments: Array, covariance: Array, extra: float) -> _Order:
+    def create(
+        cls, order: int, moments: Array, covariance: Array, extra: float, series: Array | None = None
+    ) -> _Order:
         components = np.array(list(itertools.combinations_with_replacement((0, 1), order)))
         basis = np.zeros((0, *(3,) * order))
         for chosen in itertools.combinations_with_replacement(range(3), order):
@@ -124,25 +131,30 @@ class _Order:
             turned = -np.einsum("eab,g...b->g...ae", _GENERATORS, np.moveaxis(unit, axis, -1))
             change += np.moveaxis(turned, -2, axis)
         turning = np.einsum("cd,gde->gce", whitening, change[:, *components.T])
+        series = np.zeros((len(moments), 0)) if series is None else series
+        standing = np.einsum("gs,cd->gcsd", series, whitening)
         return cls(
             components,
             basis.reshape(len(basis), -1),
             turning.reshape(len(unit), -1),
             whitening,
             moments @ whitening.T,
+            standing.reshape(*moments.shape, -1),
         )
 
     def select(self, start: int, stop: int) -> _Order:
-        return replace(self, values=self.values[start:stop])
+        return replace(self, values=self.values[start:stop], standing=self.standing[start:stop])
 
     def design(self, R: Array) -> Array:
-        """Return the whitened ``(..., G, C, U)`` components seen in the images."""
+        """Return the whitened ``(..., G, C, U + V)`` components seen in the images, and what stands."""
         axes = np.swapaxes(R, -1, -2)
         products = np.ones((*R.shape[:-2], len(self.components), 1))
         for slot in self.components.T:
             products = products[..., None] * axes[..., slot, None, :]
             products = products.reshape(*products.shape[:-2], -1)
-        return np.asarray(self.whitening @ (products @ self.basis.T))
+        seen = self.whitening @ (products @ self.basis.T)
+        standing = np.broadcast_to(self.standing, (*seen.shape[:-1], self.standing.shape[-1]))
+        return np.concatenate([seen, standing], axis=-1)
 
     def lab(self, R: Array, tensor: Array) -> Array:
         """Return ``(..., G, 3ⁿ)`` symmetric tensors of ``(..., U)`` components in lab coordinates."""
@@ -168,7 +180,7 @@ class _Order:
     def residuals(self, R: Array) -> MomentResiduals:
         design = self.design(R)
         tensor, residual, cost, normal = self.eliminate(design)
-        slopes = (self.lab(R, tensor) @ self.turning).reshape(*residual.shape, 3)
+        slopes = (self.lab(R, tensor[..., : len(self.basis)]) @ self.turning).reshape(*residual.shape, 3)
         gradient = np.einsum("...gce,...gc->...ge", slopes, residual)
-        degrees = float(self.values.size - len(self.basis))
+        degrees = float(self.values.size - design.shape[-1])
         return MomentResiduals(cost, degrees, gradient, slopes, design, normal)

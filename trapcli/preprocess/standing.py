@@ -24,15 +24,15 @@ from numpy.typing import NDArray
 from trapcli.motion import triangular
 from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
-from trapcli.motion.object_model import ObjectModel
+from trapcli.motion.object_model import Fit, ObjectModel
 from trapcli.motion.path import Path, Spline
-from trapcli.result.motion import Motion
 from trapcli.stack.frames import Frames
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_BAND = 22.0  # band times radius while the motion is fitted again
+_COARSE_BAND = 12.0  # band times radius while motions are compared
+_BAND = 22.0  # the same while the motion is fitted again
 _FINEST_BAND = 28.0  # the same in the end: that of the finest object model which judges the motion
 _SPACING = 0.7  # of the points, in units of π / band
 _REACH = 1.1  # of the points, in radii of the object
@@ -40,9 +40,8 @@ _GROUP = np.deg2rad(1.0)  # rotation over a group of frames that are averaged
 _FEWEST_GROUPS = 30
 _KNOTS = np.deg2rad(6.0)  # rotation per interval of the spline that bends the motion
 _FEWEST_KNOTS = 12
-_STEPS = 1  # of fitting the motion, each time
-_ROUNDS = 4  # of fitting one after the other
-_SETTLED = 0.1  # change of the pattern, as a share of it, that ends them
+_FROM_NEARBY = 4, 1, 0.1  # rounds; steps of fitting the motion in each; change of the pattern that ends them
+_FROM_AFAR = 10, 3, 0.01  # the same where the motion may be far off
 _VARIANCES = np.geomspace(1e-3, 1e7, 100)  # of the points, in units of what is told best
 _SIFTINGS = 40  # of the points
 _LEAST_TOLD = 1e-3  # share of a point's variance that the frames are taken to tell at least
@@ -50,17 +49,19 @@ _NEGLIGIBLE = 1e-6  # variance of a point, as a share of the typical, that is as
 _CONVINCING = 5.0  # natural logarithm of the odds at which there is a pattern
 
 
-def find_standing_pattern(low: LowBand, motion: Motion, model: ObjectModel) -> StandingPattern | None:
+def find_standing_pattern(
+    low: LowBand, center: Array, R: Array, model: ObjectModel | None = None
+) -> StandingPattern | None:
     """Find what stays in place while the particle moves.
 
     Parameters
     ----------
     low:
-        Modes of N attenuation projections about the centres of the motion.
-    motion:
-        Of the particle in them, roughly.
+        Modes of N attenuation projections about the centres.
+    center, R:
+        ``(N, 2)`` centres [length] and ``(N, 3, 3)`` rotations of the particle, roughly; NaN where not known.
     model:
-        Of the object in them: how fine its lattice is, and what the object may be like.
+        Of the object in them: how fine its lattice is, and what the object may be like, where that is known.
 
     Returns
     -------
@@ -68,37 +69,92 @@ def find_standing_pattern(low: LowBand, motion: Motion, model: ObjectModel) -> S
         At the low spatial frequencies that tell the motion; None where nothing stays, or where the motion
         isn't known.
     """
-    known = np.flatnonzero(np.isfinite(motion.R[:, 0, 0]) & np.isfinite(motion.center[:, 0]))
+    known = np.flatnonzero(np.isfinite(R[:, 0, 0]) & np.isfinite(center[:, 0]))
     if len(known) < _FEWEST_GROUPS:
         return None
-    low = low.select(known)
-    center, R, time = motion.center[known], motion.R[known], motion.time[known]
-    path = Path(time, R, R[:, 0])
-    turned = float(np.sum(np.linalg.norm(path.mean_omega(), axis=1) * np.diff(time)))
-    size = max(1, min(int(_GROUP * len(known) / turned), len(known) // _FEWEST_GROUPS))
-    finest = _Views.of(low, center, size)
-    views = finest.within(_BAND)
-    intervals = min(max(_FEWEST_KNOTS, round(turned / _KNOTS)), len(views.low.time) // 3)
-    spline = Spline(time[0], time[-1], intervals)
-    path = path.near(spline, np.concatenate([spline.grid, views.low.time]))
-    middle = np.median(center, axis=0)
+    low, center, R = low.select(known), center[known], R[known]
+    finest, path, spline = _along(low, center, Path(low.time, R, R[:, 0]))
+    views, middle = finest.within(_BAND), np.median(center, axis=0)
     points = _Points.over(views.low, middle, _BAND)
     odds, values = _pattern(views, path, points, model)
     if odds < _CONVINCING:
         return None
-    for _ in range(_ROUNDS):
-        cleared = ObjectModel(
-            views.without(points.waves @ values), _BAND / low.radius, guard=model.guard, prior=model.prior
-        )
-        fit = cleared.fit(path, views.low.time, spline, steps=_STEPS)
+    fit = _told_apart(views, path, spline, points, values, model)
+    points = _Points.over(low, middle, _FINEST_BAND)
+    _, values = _pattern(finest.shifted(fit.shift), fit.path, points, model)
+    return StandingPattern(points, values)
+
+
+def most_likely(low: LowBand, center: Array, paths: list[Path]) -> Path:
+    """Return the one of several paths that explains the frames best together with a pattern that stays.
+
+    Parameters
+    ----------
+    low:
+        Modes of N attenuation projections about their centres.
+    center:
+        ``(N, 2)`` [length].
+    paths:
+        Roughly motions of the particle, at any times.
+
+    Returns
+    -------
+    Path
+        At the times of the N projections, bent to what it explains best.
+    """
+    middle = np.median(center, axis=0)
+
+    def explained(path: Path) -> Fit:
+        finest, along, spline = _along(low, center, path)
+        views = finest.within(_COARSE_BAND)
+        points = _Points.over(views.low, middle, _COARSE_BAND)
+        _, values = _pattern(views, along, points, None)
+        return _told_apart(views, along, spline, points, values, None, from_afar=True)
+
+    best = min((explained(path) for path in paths), key=lambda fit: fit.cost)
+    n = len(low.time)
+    return Path(low.time, best.path.R[:n], best.path.omega[:n])
+
+
+def _along(low: LowBand, center: Array, path: Path) -> tuple[_Views, Path, Spline]:
+    """Return groups of frames in which a path turns little; the path at all times; what bends it."""
+    time, n = low.time, len(low.time)
+    turned = float(np.sum(np.linalg.norm(path.mean_omega(), axis=1) * np.diff(path.time)))
+    size = max(1, min(int(_GROUP * n / turned), n // _FEWEST_GROUPS))
+    views = _Views.of(low, center, size)
+    intervals = min(max(_FEWEST_KNOTS, round(turned / _KNOTS)), len(views.low.time) // 3)
+    spline = Spline(time[0], time[-1], intervals)
+    return views, path.near(spline, np.concatenate([time, spline.grid, views.low.time])), spline
+
+
+def _told_apart(
+    views: _Views,
+    path: Path,
+    spline: Spline,
+    points: _Points,
+    values: Array,
+    model: ObjectModel | None,
+    *,
+    from_afar: bool = False,
+) -> Fit:
+    """Return the motion fitted to what a pattern of ``(P,)`` values leaves, told anew each time."""
+    rounds, steps, settled = _FROM_AFAR if from_afar else _FROM_NEARBY
+    for _ in range(rounds):
+        cleared = _like(model, views.without(points.waves @ values), points.band / views.low.radius)
+        fit = cleared.fit(path, views.low.time, spline, steps=steps)
         path, before = fit.path, values
         _, values = _pattern(views.shifted(fit.shift), path, points, model)
         change = np.linalg.norm(points.waves @ (values - before))
-        if change < _SETTLED * np.linalg.norm(points.waves @ values):
+        if change < settled * np.linalg.norm(points.waves @ values):
             break
-    points = _Points.over(low, middle, _FINEST_BAND)
-    _, values = _pattern(finest.shifted(fit.shift), path, points, model)
-    return StandingPattern(points, values)
+    return fit
+
+
+def _like(model: ObjectModel | None, low: LowBand, band: float) -> ObjectModel:
+    """Return a model of other frames and another band, with lattice and prior of one that is known."""
+    if model is None:
+        return ObjectModel(low, band)
+    return ObjectModel(low, band, guard=model.guard, prior=model.prior)
 
 
 @dataclass(frozen=True)
@@ -209,7 +265,7 @@ class _Points:
         return np.asarray(np.where(near, image, 0.0))
 
 
-def _pattern(views: _Views, path: Path, points: _Points, model: ObjectModel) -> tuple[float, Array]:
+def _pattern(views: _Views, path: Path, points: _Points, model: ObjectModel | None) -> tuple[float, Array]:
     """Return the logarithm of the odds that there is a pattern, and the ``(P,)`` values of its points."""
     told = _without_object(views, path.R[-len(views.phase) :], points, model)
     # where the motion or the model is wrong, what is left over is no pattern for that alone
@@ -272,10 +328,10 @@ class _Told:
         return half.T @ (half @ self.pull), np.sum(half**2, axis=0)
 
 
-def _without_object(views: _Views, R: Array, points: _Points, model: ObjectModel) -> _Told:
+def _without_object(views: _Views, R: Array, points: _Points, known: ObjectModel | None) -> _Told:
     """Eliminate the object."""
     low = views.low
-    model = ObjectModel(low, points.band / low.radius, guard=model.guard, prior=model.prior)
+    model = _like(known, low, points.band / low.radius)
     seen = model.views(R)
     root = np.sqrt(conjugate_share(low.k) / low.variance)
     phase, modes = root * views.phase, root * low.modes
