@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,22 @@ def test_exact_moments_leave_nothing_at_the_truth(
     assert table.cost(R) < 1e-12 * wrong
 
 
+def test_what_stays_under_the_particle_is_eliminated(R: Array, rng: np.random.Generator) -> None:
+    series = np.column_stack([np.ones(FRAMES), rng.normal(size=(FRAMES, 2))])
+    low = low_band(R, rng)
+    spoilt = replace(
+        low,
+        second=low.second + series @ rng.normal(size=(3, 3)),
+        third=low.third + series @ rng.normal(size=(3, 4)),
+    )
+    table = MomentTable(spoilt, 0.01, series)
+    wrong = table.cost(np.asarray(Rotation.random(FRAMES, rng=rng).as_matrix()))
+    assert table.cost(R) < 1e-12 * wrong
+    assert MomentTable(spoilt, 0.01).cost(R) > 0.1 * wrong
+    half = table.select(0, FRAMES // 2)
+    assert half.cost(R[: FRAMES // 2]) < 1e-12 * wrong
+
+
 def test_a_turn_of_the_object_and_the_mirror_change_nothing(R: Array, rng: np.random.Generator) -> None:
     table = MomentTable(low_band(R, rng), 0.01)
     R = bent(R, rng.normal(scale=0.2, size=(FRAMES, 3)))
@@ -97,8 +114,11 @@ def test_a_turn_of_the_object_and_the_mirror_change_nothing(R: Array, rng: np.ra
     assert table.cost(sigma @ R @ sigma) == pytest.approx(cost, rel=1e-9)
 
 
-def test_the_gradient_is_half_the_slope_downhill(R: Array, rng: np.random.Generator) -> None:
-    table = MomentTable(low_band(R, rng, noise=3.0), 0.01)
+@pytest.mark.parametrize("standing", [None, np.linspace(-1, 1, FRAMES)[:, None] ** [0, 1]])
+def test_the_gradient_is_half_the_slope_downhill(
+    R: Array, rng: np.random.Generator, standing: Array | None
+) -> None:
+    table = MomentTable(low_band(R, rng, noise=3.0), 0.01, standing)
     R = bent(R, rng.normal(scale=0.1, size=(FRAMES, 3)))
     orders = table.residuals(R)
     assert sum(order.cost for order in orders) == pytest.approx(table.cost(R))
