@@ -140,14 +140,9 @@ class Found:
         return self.stack.low.shifted(center - self.stack.centers.center)
 
     @property
-    def settled(self) -> bool:
-        """Whether the motion explains all the images and is told so well that no other need be tried."""
-        return self.best is not None and _settled(*self.best, len(self.stack.low.time))
-
-    @property
     def explains(self) -> bool:
-        """Whether noise alone explains what the motion leaves, in all parts of the stack alike."""
-        return self.best is not None and certified(*self.best) and _even(self.best[1])
+        """Whether noise alone explains what the motion leaves."""
+        return self.best is not None and certified(*self.best)
 
     def without(self, pattern: ComplexArray, path: Path | None = None) -> Found:
         """Return where a path, or else this motion's, leads to without ``(N, K)`` modes in the frames."""

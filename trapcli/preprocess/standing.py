@@ -42,6 +42,8 @@ _KNOTS = np.deg2rad(6.0)  # rotation per interval of the spline that bends the m
 _FEWEST_KNOTS = 12
 _FROM_NEARBY = 4, 1, 0.1  # rounds; steps of fitting the motion in each; change of the pattern that ends them
 _FROM_AFAR = 10, 3, 0.01  # the same where the motion may be far off
+_ROUGHLY = 3, 3, 0.01  # the same to see which of several motions may be right
+_LIKELY = 2  # of them that are looked into further
 _VARIANCES = np.geomspace(1e-3, 1e7, 100)  # of the points, in units of what is told best
 _SIFTINGS = 40  # of the points
 _LEAST_TOLD = 1e-3  # share of a point's variance that the frames are taken to tell at least
@@ -104,14 +106,16 @@ def most_likely(low: LowBand, center: Array, paths: list[Path]) -> Path:
     """
     middle = np.median(center, axis=0)
 
-    def explained(path: Path) -> Fit:
+    def explained(path: Path, patience: tuple[int, int, float]) -> Fit:
         finest, along, spline = _along(low, center, path)
         views = finest.within(_COARSE_BAND)
         points = _Points.over(views.low, middle, _COARSE_BAND)
         _, values = _pattern(views, along, points, None)
-        return _told_apart(views, along, spline, points, values, None, from_afar=True)
+        return _told_apart(views, along, spline, points, values, None, patience)
 
-    best = min((explained(path) for path in paths), key=lambda fit: fit.cost)
+    roughly = sorted((explained(path, _ROUGHLY) for path in paths), key=lambda fit: fit.cost)
+    likely = (explained(fit.path.ascending(), _FROM_AFAR) for fit in roughly[:_LIKELY])
+    best = min(likely, key=lambda fit: fit.cost)
     n = len(low.time)
     return Path(low.time, best.path.R[:n], best.path.omega[:n])
 
@@ -134,11 +138,10 @@ def _told_apart(
     points: _Points,
     values: Array,
     model: ObjectModel | None,
-    *,
-    from_afar: bool = False,
+    patience: tuple[int, int, float] = _FROM_NEARBY,
 ) -> Fit:
     """Return the motion fitted to what a pattern of ``(P,)`` values leaves, told anew each time."""
-    rounds, steps, settled = _FROM_AFAR if from_afar else _FROM_NEARBY
+    rounds, steps, settled = patience
     for _ in range(rounds):
         cleared = _like(model, views.without(points.waves @ values), points.band / views.low.radius)
         fit = cleared.fit(path, views.low.time, spline, steps=steps)
