@@ -143,12 +143,17 @@ def _joint(projections: Frames, config: MotionConfig, guessed: bool, **about: An
 
     found = find(projections)
     if guessed:
-        projections, found = _without_dust(projections, found, find, about["pixel_size"])
+        pixel_size, progress = about["pixel_size"], about["progress"]
+        projections, found = _without_dust(projections, found, find, pixel_size, progress)
     return projections, found.refined().motion()
 
 
 def _without_dust(
-    projections: Frames, found: Found, find: Callable[[Frames], Found], pixel_size: float
+    projections: Frames,
+    found: Found,
+    find: Callable[[Frames], Found],
+    pixel_size: float,
+    progress: Progress | None = None,
 ) -> tuple[Frames, Found]:
     """Take off what stays in place under the particle, if that explains the images better."""
     from trapcli.preprocess.standing import find_standing_pattern, most_likely, without
@@ -169,7 +174,7 @@ def _without_dust(
         return best
     # so much may stay in place that it hides the motion
     low, centers = stack.low.select(stack.used), center[stack.used]
-    path = most_likely(low, centers, found.despite_standing())
+    path = most_likely(low, centers, found.despite_standing(progress), progress)
     hidden = find_standing_pattern(low, centers, path.R)
     if hidden is not None:
         best = _better(best, (less(hidden), found.without(hidden.modes(center), path)))

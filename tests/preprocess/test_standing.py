@@ -118,7 +118,7 @@ def found_by(motion: Motion, *, residual: float, explains: bool) -> SimpleNamesp
         best=(SimpleNamespace(model=None), None),
         stack=SimpleNamespace(centers=motion, low=low, used=np.arange(len(motion))),
         explains=explains,
-        despite_standing=list,
+        despite_standing=lambda _: [],
     )
 
 

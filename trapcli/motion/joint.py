@@ -158,13 +158,13 @@ class Found:
         stack, best = _quieter(stack, self.pace, *best)
         return replace(self, stack=stack, best=best)
 
-    def despite_standing(self) -> list[Path]:
+    def despite_standing(self, progress: Progress | None = None) -> list[Path]:
         """Return paths of motions that lines and moments allow where something stays in place."""
         evidence, turn = _evidence(self.stack, self.pace, standing=True)
         found: list[Hypothesis] = []
         for attempt, (window, middle) in enumerate(_ATTEMPTS):
             tried = replace(evidence, seed=attempt)
-            branches = find_branches(tried, window=window, middle=middle, turn=turn)
+            branches = find_branches(tried, window=window, middle=middle, turn=turn, progress=progress)
             found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_DESPITE)
         return [h.path for h in found]
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trapcli.motion import triangular
+from trapcli.motion.centers import Progress
 from trapcli.motion.fourier_slices import conjugate_share
 from trapcli.motion.low_band import SQUARE, LowBand, group_means
 from trapcli.motion.object_model import Fit, ObjectModel
@@ -87,7 +88,7 @@ def find_standing_pattern(
     return StandingPattern(points, values)
 
 
-def most_likely(low: LowBand, center: Array, paths: list[Path]) -> Path:
+def most_likely(low: LowBand, center: Array, paths: list[Path], progress: Progress | None = None) -> Path:
     """Return the one of several paths that explains the frames best together with a pattern that stays.
 
     Parameters
@@ -98,6 +99,8 @@ def most_likely(low: LowBand, center: Array, paths: list[Path]) -> Path:
         ``(N, 2)`` [length].
     paths:
         Roughly motions of the particle, at any times.
+    progress:
+        Called as ``progress("specks", done, total)``.
 
     Returns
     -------
@@ -113,9 +116,16 @@ def most_likely(low: LowBand, center: Array, paths: list[Path]) -> Path:
         _, values = _pattern(views, along, points, None)
         return _told_apart(views, along, spline, points, values, None, patience)
 
-    roughly = sorted((explained(path, _ROUGHLY) for path in paths), key=lambda fit: fit.cost)
-    likely = (explained(fit.path.ascending(), _FROM_AFAR) for fit in roughly[:_LIKELY])
-    best = min(likely, key=lambda fit: fit.cost)
+    def every(paths: list[Path], patience: tuple[int, int, float]) -> list[Fit]:
+        fits = []
+        for done, path in enumerate(paths):
+            if progress is not None:
+                progress("specks", done, len(paths))
+            fits.append(explained(path, patience))
+        return sorted(fits, key=lambda fit: fit.cost)
+
+    roughly = every(paths, _ROUGHLY)
+    best = every([fit.path.ascending() for fit in roughly[:_LIKELY]], _FROM_AFAR)[0]
     n = len(low.time)
     return Path(low.time, best.path.R[:n], best.path.omega[:n])
 
