@@ -34,6 +34,10 @@ if TYPE_CHECKING:  # each method is imported only when it is used
 
 Progress = Callable[[str, int, int], None]
 
+_CLIPPED = (
+    0.1  # share of the frames that may cut off a part of the particle where a pattern may hide its motion
+)
+
 
 def estimate(
     frames: Frames | NDArray[Any],
@@ -170,7 +174,8 @@ def _without_dust(
     if pattern is not None:
         cleared = less(pattern)
         best = _better(best, (cleared, found.without(pattern.modes(center))))
-    if best[1].explains:
+    # a pattern could make up for what is cut off of a particle that is larger than the field, with any motion
+    if best[1].explains or stack.centers.clipped[stack.used].mean() > _CLIPPED:
         return best
     # so much may stay in place that it hides the motion
     low, centers = stack.low.select(stack.used), center[stack.used]

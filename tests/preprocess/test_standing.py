@@ -116,7 +116,11 @@ def found_by(motion: Motion, *, residual: float, explains: bool) -> SimpleNamesp
         motion=lambda **_: told,
         about=lambda _: None,
         best=(SimpleNamespace(model=None), None),
-        stack=SimpleNamespace(centers=motion, low=low, used=np.arange(len(motion))),
+        stack=SimpleNamespace(
+            centers=SimpleNamespace(center=motion.center, clipped=np.zeros(len(motion), bool)),
+            low=low,
+            used=np.arange(len(motion)),
+        ),
         explains=explains,
         despite_standing=lambda _: [],
     )
