@@ -34,9 +34,7 @@ if TYPE_CHECKING:  # each method is imported only when it is used
 
 Progress = Callable[[str, int, int], None]
 
-_CLIPPED = (
-    0.1  # share of the frames that may cut off a part of the particle where a pattern may hide its motion
-)
+_CLIPPED = 0.1  # share of the frames that may cut off a part of a particle whose motion dust may hide
 
 
 def estimate(

@@ -126,13 +126,19 @@ def found_by(motion: Motion, *, residual: float, explains: bool) -> SimpleNamesp
     )
 
 
-@pytest.mark.parametrize("better", [True, False])
-def test_a_pattern_counts_only_where_it_explains_the_images(
-    better: bool, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
+@pytest.fixture
+def a_pattern(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Something that is always found to stay."""
     pattern = SimpleNamespace(image=lambda *_: specks(1.0), modes=lambda center: center)
     monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: pattern)
+
+
+@pytest.mark.usefixtures("a_pattern")
+@pytest.mark.parametrize("better", [True, False])
+def test_a_pattern_counts_only_where_it_explains_the_images(
+    better: bool, turning: tuple[np.ndarray, Motion]
+) -> None:
+    frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
     found = found_by(truth, residual=2.0, explains=True)
     again = found_by(truth, residual=1.0 if better else 3.0, explains=True)
     found.without = lambda *_: again
@@ -141,13 +147,12 @@ def test_a_pattern_counts_only_where_it_explains_the_images(
     assert bool(taken.info.warnings) == better
 
 
+@pytest.mark.usefixtures("a_pattern")
 @pytest.mark.parametrize("best", [0, 1, 2, 3])
 def test_where_nothing_explains_the_images_the_best_of_all_is_taken(
     best: int, turning: tuple[np.ndarray, Motion], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     frames, truth = Frames.from_array(turning[0].astype(np.float32)), turning[1]
-    pattern = SimpleNamespace(image=lambda *_: specks(1.0), modes=lambda center: center)
-    monkeypatch.setattr("trapcli.preprocess.standing.find_standing_pattern", lambda *_: pattern)
     monkeypatch.setattr("trapcli.preprocess.standing.most_likely", lambda *_: truth)
     residuals = [3.0, 4.0, 5.0, 6.0]
     residuals[best] = 2.0

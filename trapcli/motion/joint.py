@@ -161,11 +161,7 @@ class Found:
     def despite_standing(self, progress: Progress | None = None) -> list[Path]:
         """Return paths of motions that lines and moments allow where something stays in place."""
         evidence, turn = _evidence(self.stack, self.pace, standing=True)
-        found: list[Hypothesis] = []
-        for attempt, (window, middle) in enumerate(_ATTEMPTS):
-            tried = replace(evidence, seed=attempt)
-            branches = find_branches(tried, window=window, middle=middle, turn=turn, progress=progress)
-            found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_DESPITE)
+        *_, found = _searched(evidence, turn, _MOST_DESPITE, progress)
         return [h.path for h in found]
 
     def refined(self) -> Found:
@@ -455,15 +451,24 @@ def _evidence(stack: Stack, pace: float, *, standing: bool = False) -> tuple[Evi
     return Evidence(low.time, lines, MomentTable(low, _MOMENT_ERROR, series)), size * pace
 
 
+def _searched(
+    evidence: Evidence, turn: float, most: int, progress: Progress | None
+) -> Iterator[list[Hypothesis]]:
+    """Yield the best motions so far, after the search from each window."""
+    found: list[Hypothesis] = []
+    for attempt, (window, middle) in enumerate(_ATTEMPTS):
+        tried = replace(evidence, seed=attempt)
+        branches = find_branches(tried, window=window, middle=middle, turn=turn, progress=progress)
+        found = distinct([*found, *(evidence.judge(h.path) for h in branches)], most)
+        yield found
+
+
 def _hypotheses(stack: Stack, pace: float, progress: Progress | None) -> Iterator[list[Hypothesis]]:
     """Yield motions that common lines and moments allow: of the first window that fits, then of all."""
     evidence, turn = _evidence(stack, pace)
-    found: list[Hypothesis] = []
     yielded: list[Hypothesis] = []
-    for attempt, (window, middle) in enumerate(_ATTEMPTS):
-        last, tried = attempt == len(_ATTEMPTS) - 1, replace(evidence, seed=attempt)
-        branches = find_branches(tried, window=window, middle=middle, turn=turn, progress=progress)
-        found = distinct([*found, *(evidence.judge(h.path) for h in branches)], _MOST_HYPOTHESES[1])
+    for attempt, found in enumerate(_searched(evidence, turn, _MOST_HYPOTHESES[1], progress)):
+        last = attempt == len(_ATTEMPTS) - 1
         fits = found[0].lines < _FITS and found[0].moments < _FITS
         if last:
             again = [turned_back(evidence, h, turn) for h in found[:_TURNED_BACK]]

@@ -291,7 +291,7 @@ def _in_gauge(phi: Array) -> tuple[Array, bool]:
 
 def _centers(stack: Stack, fit: Fit, assessment: Assessment) -> tuple[Array, Array]:
     """Return the centres C₂, where the object model is in each frame, and the errors of T."""
-    used = np.flatnonzero(stack.seen & ~stack.outlying)
+    used = stack.used
     own, errors = fit.model.locate(fit, assessment.covariance, fit.path.R[used], stack.low.select(used))
     time = stack.low.time
     place, errors = (interpolated(time, time[used], series) for series in (own, errors))
