@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,8 @@ _SURVEY_BYTES = 128 << 20  # that they may take
 _RING = 2.0  # width of the rings of the radial profile [pixels]
 _VISIBLE = 0.06  # least power of a ring that counts as object, in units of the noise's
 _PLATEAU = 0.2  # power of the empty field beyond the noise's, in its units, that may be a misjudged noise
+_GAP = 4, 0.25  # rings without anything, in all and as a share of those within, beyond which there may be
+_BESIDE = 0.01  # something else, if it holds no more than this share of the power
 _COARSE = 256  # pixels across on which the radius is measured
 _SIGNIFICANT = 5.0  # standard deviations
 _BLANK = 0.02  # share of the median mass below which a frame holds no object
@@ -309,8 +312,18 @@ def object_radius(images: NDArray[Any], noise: float) -> float:
         seen = np.flatnonzero(power > least * pixels)
         if not len(seen):
             return farthest
-        radius = min(_RING * (seen[-1] + 1.0), farthest)
+        radius = min(_RING * (_outermost(seen, power) + 1.0), farthest)
     return radius
+
+
+def _outermost(seen: NDArray[np.intp], power: Array) -> int:
+    """Return the last ring of the object among those `seen`: what is left of a background lies apart."""
+    whole = float(power[seen].sum())
+    for ring, following in pairwise(seen):
+        apart = following - ring > max(_GAP[0], _GAP[1] * ring)
+        if apart and power[seen[seen > ring]].sum() < _BESIDE * whole:
+            return int(ring)
+    return int(seen[-1])
 
 
 def disc(shape: tuple[int, ...], center: Array, radius: float) -> tuple[Array, slice, slice]:
