@@ -23,6 +23,7 @@ Bools = NDArray[np.bool_]
 _CLEARLY_DARK = 0.1  # share of a frame's peak that belongs to the particle
 _PARTS = 8  # of the stack, in which a speck must be found
 _INDEPENDENT = 20  # projections that differ enough for their mean to have less variance by this factor
+_SELDOM = 20.0  # variance of what is measured beside it, in units of that of the mean of all frames
 _SHARP = (0.7, 3.0)  # widths of the two means between which a speck shows [pixels]
 _ROUND = 0.3  # least ratio of a speck's curvatures
 _SEEN = 4.0  # standard errors by which a candidate stands out
@@ -64,17 +65,22 @@ class Standing:
         ``(K, H, W)`` log(I / I₀), all of them.
     drift:
         ``(K, 2)`` by how much the particle is away from its mean place (rows, columns) [pixels].
+    hidden:
+        ``(H, W)`` where the frames hold the particle as well.
     """
 
     image: Array
     error: float
     frames: Stack
     drift: Array
+    hidden: Bools
 
     @classmethod
-    def of(cls, frames: Stack, noise: float) -> Self:
+    def of(cls, frames: Stack, noise: float, hidden: Bools | None = None) -> Self:
         """Summarise ``(K, H, W)`` log(I / I₀) with pixel noise of a standard deviation `noise`."""
-        return cls(_mean(frames), noise / np.sqrt(len(frames)), frames, _drift(frames))
+        everywhere = np.ones(frames.shape[1:], bool)
+        error = noise / np.sqrt(len(frames))
+        return cls(_mean(frames), error, frames, _drift(frames), everywhere if hidden is None else hidden)
 
     @cached_property
     def changes(self) -> Array:
@@ -346,14 +352,18 @@ def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: B
     """Return the Cholesky factor of the covariance of the mean projection, its noise, and any paraboloid."""
     frames = np.nan_to_num(standing.frames[:, rows, columns])
     height, width = frames.shape[1:]
-    taper = np.multiply.outer(*(np.hanning(size + 2)[1:-1] for size in (height, width)))
+    hidden = standing.hidden[rows, columns]
+    taper = np.multiply.outer(*(np.hanning(size + 2)[1:-1] for size in (height, width))) * hidden
     changes = (frames - frames.mean(axis=0)) * taper
     power = np.mean(np.abs(np.fft.fft2(changes, s=(2 * height, 2 * width))) ** 2, axis=0)
-    by_lag = np.fft.ifft2(power).real / np.sum(taper**2)
+    by_lag = np.fft.ifft2(power).real / max(float(np.sum(taper**2)), 1.0)
     x2, x1 = (axis[keep] for axis in np.mgrid[:height, :width])
     covariance = by_lag[x2[:, None] - x2, x1[:, None] - x1] / _INDEPENDENT
-    covariance[np.diag_indices_from(covariance)] += standing.error**2 + 1e-10
+    covariance *= np.multiply.outer(hidden[keep], hidden[keep])
+    variance = standing.error**2 * np.where(hidden[keep], 1.0, _SELDOM)
+    covariance[np.diag_indices_from(covariance)] += variance + 1e-10
     right, down = (x1 - x1.mean()) / width, (x2 - x2.mean()) / height
     smooth = np.stack([np.ones(len(x1)), right, down, right**2, down**2, right * down], axis=1)
+    smooth *= hidden[keep][:, None]
     covariance += smooth @ smooth.T
     return np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False))

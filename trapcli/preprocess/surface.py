@@ -12,9 +12,9 @@ are averaged to cells for that. Only what is sharp is looked for pixel by pixel.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -38,10 +38,16 @@ _DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, 
 _CLEAR = 0.8  # the same in standard deviations of a cell: 4 of the mean over a patch
 _ALWAYS = 0.9  # share of the frames in which dust is seen
 _SMALL = 0.1  # its area as a share of the particle's
+_ALONE = 0.8, 0.95  # quantiles in time that dust is like while nothing covers it
+_MISFIT = 0.3  # of dust that is roughly known, as a share of its depth
+_HALF = 0.5  # the same at most where it stays as it is
+_STILL = 2.5  # scatter in time, in units of the empty field's, up to which it does
+_RIM = 0.95  # share of its cells that do
 _MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
 _DIRECT = (
     0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
 )
+_SELDOM = 0.05  # the same where dust is roughly known
 _SIGNIFICANT = 4.0  # standard deviations
 _QUIET = 0.95  # share of frames in which a cell that tells the brightness lies outside of the particle
 _LEAST_QUIET = 0.02  # share of such cells below which the border has to do
@@ -205,8 +211,66 @@ def fit_empty_field(sample: Sample) -> EmptyField:
     common[edge] = _middle(light.even(logs)[0][:, edge])
     known = _fit_surface(common, np.isfinite(common), 2, cells).over(cells)
     for depth in _DEPTHS:
+        look = _Look.at(logs, known, light, noise, depth, cells)
+        known, light = look.known, look.light
+    field, pattern, specks = look.field_of(sample, deceived=True)
+    if specks:
+        # dust that is roughly known no longer passes for the particle, which may leave it free at times
+        known = averaged(field + pattern, cells)
+        dust = np.abs(averaged(pattern, cells))
+        look = _Look.at(logs, known, light, noise, _DEPTHS[-1], cells, dust)
+        field, pattern, specks = look.field_of(sample, deceived=False)
+    told = [image[np.isfinite(image)] for image in look.evened if np.isfinite(image).any()]
+    return EmptyField(
+        log_light=field + pattern,
+        light=look.light,
+        outside=look.outside.mean(axis=0),
+        depth=float(np.median([np.quantile(-values, 0.999) for values in told])),
+        degree=look.degree,
+        specks=specks,
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """What frames in cells tell of the field, given roughly what it is.
+
+    Attributes
+    ----------
+    light, levels:
+        Tells the brightness of a frame, and what it tells.
+    outside:
+        ``(K, h, w)`` cells that the particle leaves free.
+    evened:
+        ``(K, h, w)`` log I / I₀, equally bright.
+    surface, degree:
+        Fitted to what is free.
+    known:
+        ``(h, w)`` log I₀: that surface, and what is measured beside it.
+    """
+
+    light: Light
+    levels: Array
+    outside: Bools
+    evened: Stack
+    surface: _Surface
+    degree: int
+    known: Array
+
+    @classmethod
+    def at(
+        cls,
+        logs: Stack,
+        known: Array,
+        light: Light,
+        noise: float,
+        depth: float,
+        cells: Cells,
+        dust: NDArray[Any] | None = None,
+    ) -> Self:
+        """Look at ``(K, h, w)`` log I, before a field that is roughly `known`, as deep as `dust` makes it."""
         ratios = logs - known.astype(np.float32)
-        outside = _outside(light.even(ratios)[0], noise, depth)
+        outside = _outside(light.even(ratios)[0], noise, depth, dust)
         quiet = outside.mean(axis=0) >= _QUIET
         light = Light.over(quiet, cells, tilted=_is_tilted(ratios, quiet, noise, cells))
         evened, levels = light.even(ratios)
@@ -216,17 +280,17 @@ def fit_empty_field(sample: Sample) -> EmptyField:
         surface = _fit_surface(mean, count, degree, cells)
         field = surface.over(cells)
         known = field + _measured(mean - field, count, len(logs), noise)[0]
-    told = [image[np.isfinite(image)] for image in evened if np.isfinite(image).any()]
-    residuals = _Residuals(sample, surface.over(Cells(cells.shape)).astype(np.float32), light, levels)
-    pattern, specks = _pattern(residuals, outside)
-    return EmptyField(
-        log_light=residuals.field + pattern,
-        light=light,
-        outside=outside.mean(axis=0),
-        depth=float(np.median([np.quantile(-values, 0.999) for values in told])),
-        degree=degree,
-        specks=specks,
-    )
+        return cls(light, levels, outside, evened, surface, degree, known)
+
+    def field_of(self, sample: Sample, *, deceived: bool) -> tuple[Stack, Stack, int]:
+        """Return the ``(H, W)`` surface, what it lacks, and the number of specks under the particle.
+
+        Where the particle makes up for a speck that is not known yet, a pixel looks free that isn't: such
+        measurements are not believed if `deceived`.
+        """
+        surface = self.surface.over(Cells(self.light.cells.shape)).astype(np.float32)
+        residuals = _Residuals(sample, surface, self.light, self.levels)
+        return surface, *_pattern(residuals, self.outside, deceived=deceived)
 
 
 @dataclass(frozen=True)
@@ -305,28 +369,56 @@ def _noise(logs: Stack, edge: Bools) -> float:
     return float(1.4826 * np.median(np.abs(changes)) / 2) if len(changes) else 0.0
 
 
-def _outside(residual: Stack, noise: float, depth: float) -> Bools:
+def _outside(residual: Stack, noise: float, depth: float, dust: NDArray[Any] | None = None) -> Bools:
     """Tell which cells of each frame the particle leaves free, with a margin around it."""
     smooth = np.empty_like(residual)
     for image, raw in zip(smooth, residual, strict=True):
         ndimage.uniform_filter(np.nan_to_num(raw), _PATCH, output=image)
-    np.abs(smooth, out=smooth)
-    peak = float(np.median([np.quantile(image, 0.999) for image in smooth]))
-    inside = smooth > max(_CLEAR * noise, depth * peak)
-    inside &= ~_stuck(inside)
+    peak = float(np.median([np.quantile(np.abs(image), 0.999) for image in smooth]))
+    least = max(_CLEAR * noise, depth * peak)
+    inside = np.abs(smooth) > least
+    # where there is dust, what is darker than that alone is particle
+    free = ~inside.any(axis=0)
+    usual = float(np.median(_scatter(smooth[:, free][:, :: max(1, int(free.sum()) // _TYPICAL_CELLS)])))
+    stuck = _stuck(inside, smooth, usual)
+    if dust is not None:
+        near = ndimage.maximum_filter(dust, _PATCH)
+        uncovered, lightest = np.quantile(smooth[:, near > least], _ALONE, axis=0)
+        told = (np.abs(uncovered) < _MISFIT * near[near > least]) & (lightest - uncovered < _STILL * usual)
+        stuck[near > least] |= told
+    alone = np.quantile(smooth[:, stuck], _ALONE[0], axis=0)
+    inside[:, stuck] = np.abs(smooth[:, stuck] - alone) > least
     reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
     for image in inside:
         image[:] = ndimage.maximum_filter(image, reach)
     return ~inside & np.isfinite(residual)
 
 
-def _stuck(inside: Bools) -> Bools:
-    """Tell what is in all frames and small beside the particle: dust, which would hide what it covers."""
-    labels, _ = ndimage.label(inside.mean(axis=0) > _ALWAYS)
+def _stuck(inside: Bools, smooth: Stack, usual: float) -> Bools:
+    """Tell where there is dust, which is in all frames.
+
+    It is small beside the particle, or it stays as it is, but for `usual` noise, while something else changes.
+    """
+    labels, count = ndimage.label(inside.mean(axis=0) > _ALWAYS)
     sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    small = (sizes > 0) & (sizes < _SMALL * np.median(inside.sum(axis=(1, 2))))
-    return np.asarray(small[labels])
+    whole = float(np.median(inside.sum(axis=(1, 2))))
+    stuck = sizes < _SMALL * whole
+    # what little the particle always covers may be smaller than dust, but that it turns shows at its rim
+    still = np.zeros(count + 1, bool)
+    for label in range(1, count + 1):
+        rim = ndimage.binary_dilation(labels == label, iterations=_PATCH // 2)
+        still[label] = np.quantile(_scatter(smooth[:, rim]), _RIM) < _STILL * usual
+    if (~still[1:] & ~stuck[1:]).any():
+        stuck |= still & (sizes < _HALF * whole)
+    stuck[0] = False
+    return ndimage.binary_dilation(stuck[labels], iterations=_PATCH // 2)
+
+
+def _scatter(series: Stack) -> Array:
+    """Return the standard deviations in time of ``(K, P)`` cells, told by the more usual half."""
+    if not series.size:
+        return np.full(max(1, series.shape[1]), np.inf)
+    return np.asarray(1.4826 * np.median(np.abs(series - np.median(series, axis=0)), axis=0))
 
 
 def _mean_outside(
@@ -389,9 +481,11 @@ def _degree(mean: Array, count: Real, cells: Cells) -> int:
     return _DEGREES[int(np.argmin(errors))]
 
 
-def _measured(direct: Real, count: Real, frames: int, noise: float) -> tuple[Real, Bools]:
+def _measured(
+    direct: Real, count: Real, frames: int, noise: float, least: float = _DIRECT
+) -> tuple[Real, Bools]:
     """Return what the surface lacks where that is measured outside of the particle, and where it is."""
-    measured = np.asarray(count >= _DIRECT * frames)
+    measured = np.asarray(count >= max(least * frames, 1))
     scatter = noise / np.sqrt(np.maximum(count, 1))
     clear = measured & (np.abs(direct) > _SIGNIFICANT * scatter)
     faint = measured & ~clear
@@ -402,7 +496,7 @@ def _measured(direct: Real, count: Real, frames: int, noise: float) -> tuple[Rea
     return np.where(measured, trust * direct, 0), measured
 
 
-def _pattern(residuals: _Residuals, outside: Bools) -> tuple[Stack, int]:
+def _pattern(residuals: _Residuals, outside: Bools, *, deceived: bool) -> tuple[Stack, int]:
     """Return what the surface lacks in pixels: what is measured beside the particle, and specks under it."""
     cells, count_of_frames = residuals.light.cells, len(outside)
     free = (_in_pixels(image, cells) for image in outside)
@@ -420,14 +514,19 @@ def _pattern(residuals: _Residuals, outside: Bools) -> tuple[Stack, int]:
 
     direct, count = _mean_outside(keeping(), free, hidden.shape)
     noise = _noise_of_pixels(residuals)
-    pattern, measured = _measured(direct, count, count_of_frames, noise)
+    least = _DIRECT if deceived else _SELDOM
+    pattern, measured = _measured(direct, count, count_of_frames, noise, least)
     if not hidden.any():
         return pattern, 0
-    specks, number = find_specks(Standing.of(kept, noise), measured[rows, columns])
-    # a pixel that looks free when the particle happens to make up for a speck deceives
-    fitted = (np.abs(specks) > _FOOTPRINT) & (count[rows, columns] < _QUIET * count_of_frames)
-    inside = pattern[rows, columns]
-    pattern[rows, columns] = np.where(measured[rows, columns] & ~fitted, inside, specks)
+    believed, image = measured[rows, columns], pattern[rows, columns]
+    standing = Standing.of(kept, noise)
+    if not deceived:
+        kept[:, believed] = image[believed]
+        standing = replace(Standing.of(kept, noise, ~believed), drift=standing.drift)
+    specks, number = find_specks(standing, believed)
+    if deceived:
+        believed &= (np.abs(specks) <= _FOOTPRINT) | (count[rows, columns] >= _QUIET * count_of_frames)
+    pattern[rows, columns] = np.where(believed, pattern[rows, columns], specks)
     return pattern, number
 
 
