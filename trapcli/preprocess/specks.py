@@ -65,22 +65,37 @@ class Standing:
         ``(K, H, W)`` log(I / I₀), all of them.
     drift:
         ``(K, 2)`` by how much the particle is away from its mean place (rows, columns) [pixels].
-    hidden:
-        ``(H, W)`` where the frames hold the particle as well.
+    measured:
+        ``(H, W)`` log(I / I₀) where it is known from frames that the particle leaves free there, else NaN.
     """
 
     image: Array
     error: float
     frames: Stack
     drift: Array
-    hidden: Bools
+    measured: Array
 
     @classmethod
-    def of(cls, frames: Stack, noise: float, hidden: Bools | None = None) -> Self:
+    def of(cls, frames: Stack, noise: float, measured: Array | None = None) -> Self:
         """Summarise ``(K, H, W)`` log(I / I₀) with pixel noise of a standard deviation `noise`."""
-        everywhere = np.ones(frames.shape[1:], bool)
-        error = noise / np.sqrt(len(frames))
-        return cls(_mean(frames), error, frames, _drift(frames), everywhere if hidden is None else hidden)
+        if measured is None:
+            measured = np.full(frames.shape[1:], np.nan)
+        return cls(_mean(frames), noise / np.sqrt(len(frames)), frames, _drift(frames), measured)
+
+    @property
+    def hidden(self) -> Bools:
+        """``(H, W)`` where the particle may always be."""
+        return np.isnan(self.measured)
+
+    @property
+    def best(self) -> Array:
+        """``(H, W)`` what is measured, and else the mean in time."""
+        return np.where(self.hidden, self.image, self.measured)
+
+    def seen(self, rows: slice, columns: slice) -> Stack:
+        """Return some pixels of all frames; what is measured is alike in all."""
+        frames, measured = np.nan_to_num(self.frames[:, rows, columns]), self.measured[rows, columns]
+        return np.where(np.isnan(measured), frames, measured.astype(np.float32))
 
     @cached_property
     def changes(self) -> Array:
@@ -96,8 +111,8 @@ class Standing:
         return np.asarray(ndimage.gaussian_filter(variance, _SHARP[1]) / len(parts))
 
 
-def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
-    """Return the specks that are not wholly in `free`, as they are in log I₀, and their number.
+def find_specks(standing: Standing, free: Bools) -> list[Array]:
+    """Return the specks (row, column, size, depth) that are near what is not `free`, and those in it.
 
     Parameters
     ----------
@@ -105,11 +120,10 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
         ``(H, W)`` where no specks are needed: the image itself is the background.
     """
     shape = standing.image.shape
-    if free.all():
-        return np.zeros(shape), 0
-    reach = ndimage.binary_dilation(~free, iterations=_REACH)
-    whole = float(np.abs(standing.image).sum())
     specks: list[Array] = []
+    if free.all():
+        return specks
+    reach = ndimage.binary_dilation(~free, iterations=_REACH)
     refused = np.zeros(shape, bool)
     for _ in range(_ROUNDS):
         found = False
@@ -117,24 +131,46 @@ def find_specks(standing: Standing, free: Bools) -> tuple[Array, int]:
         for place in places:
             if any(np.hypot(*(speck[:2] - place)) < _APART for speck in specks):
                 continue
-            near = [k for k, speck in enumerate(specks) if np.hypot(*(speck[:2] - place)) < _TOGETHER]
-            fitted = _fit(standing, place, specks, near, places)
-            if fitted is None or np.abs(render([fitted[0]], shape)).sum() > _MOST * whole:
+            if _add(specks, standing, place, places):
+                found = True
+            else:
                 rows, columns = _window(place, shape, 2)
                 refused[rows, columns] = True
-                continue
-            for k, speck in zip(near, fitted[1:], strict=True):
-                specks[k] = speck
-            specks.append(fitted[0])
-            found = True
         if not found:
             break
-    covered = [speck for speck in specks if not free[_pixel(speck, shape)]]
-    return render(specks, shape), len(covered)
+    return specks
 
 
-def _pixel(speck: Array, shape: tuple[int, ...]) -> tuple[int, int]:
-    row, column = np.clip(np.rint(speck[:2]).astype(int), 0, np.array(shape) - 1)
+def fit_again(standing: Standing, specks: list[Array]) -> list[Array]:
+    """Return specks fitted to what is measured now; those that can't be fitted stay as they are."""
+    places = np.array([speck[:2] for speck in specks])
+    again: list[Array] = []
+    for speck in specks:
+        if not _add(again, standing, speck[:2], places):
+            again.append(speck)
+    return again
+
+
+def _add(specks: list[Array], standing: Standing, place: Array, places: Array) -> bool:
+    """Add a speck at `place`, one of several, and fit those near it again; tell whether there is one."""
+    near = [k for k, speck in enumerate(specks) if np.hypot(*(speck[:2] - place)) < _TOGETHER]
+    fitted = _fit(standing, place, specks, near, places)
+    whole = float(np.abs(standing.image).sum())
+    if fitted is None or np.abs(render([fitted[0]], standing.image.shape)).sum() > _MOST * whole:
+        return False
+    for k, speck in zip(near, fitted[1:], strict=True):
+        specks[k] = speck
+    specks.append(fitted[0])
+    return True
+
+
+def covered(specks: list[Array], free: Bools) -> int:
+    """Return how many of them are not in `free`."""
+    return sum(not free[_pixel(speck, free.shape)] for speck in specks)
+
+
+def _pixel(place: Array, shape: tuple[int, ...]) -> tuple[int, int]:
+    row, column = np.clip(np.rint(place[:2]).astype(int), 0, np.array(shape) - 1)
     return int(row), int(column)
 
 
@@ -297,11 +333,11 @@ def _fit(
     keep = _own(x2, x1, place, places, known)
     window = _Window(rows, columns, keep, _root_of_covariance(standing, rows, columns, keep))
     others = render([speck for k, speck in enumerate(specks) if k not in near], shape)
-    sign = np.sign(_sharp(standing.image - others)[tuple(place.astype(int))])
-    target = window.of(standing.image - others)
+    sign = np.sign(_sharp(standing.image - others)[_pixel(place, shape)])
+    target = window.of(standing.best - others)
     starts = [np.array([[*place, size, -0.1 * sign], *known]) for size in _SIZES]
     found = min((window.fit(start, target) for start in starts), key=lambda result: float(result.cost))
-    frames = np.nan_to_num(standing.frames[:, rows, columns]) - others[rows, columns]
+    frames = standing.seen(rows, columns) - others[rows, columns]
     series = window.white(frames[:, keep].T)
     # frames in which the particle is smooth here tell more
     left = series - window.profiles(found.x.reshape(-1, 4))[:, None]
@@ -350,7 +386,7 @@ def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
 
 def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> Array:
     """Return the Cholesky factor of the covariance of the mean projection, its noise, and any paraboloid."""
-    frames = np.nan_to_num(standing.frames[:, rows, columns])
+    frames = standing.seen(rows, columns)
     height, width = frames.shape[1:]
     hidden = standing.hidden[rows, columns]
     taper = np.multiply.outer(*(np.hanning(size + 2)[1:-1] for size in (height, width))) * hidden

@@ -12,7 +12,7 @@ are averaged to cells for that. Only what is sharp is looked for pixel by pixel.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Self
 
@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from trapcli.motion.cells import Cells
 from trapcli.preprocess.counts import Sample
-from trapcli.preprocess.specks import MARGIN, Standing, find_specks
+from trapcli.preprocess.specks import MARGIN, Standing, covered, find_specks, fit_again, render
 
 Array = NDArray[np.float64]
 Stack = NDArray[np.float32]
@@ -213,21 +213,21 @@ def fit_empty_field(sample: Sample) -> EmptyField:
     for depth in _DEPTHS:
         look = _Look.at(logs, known, light, noise, depth, cells)
         known, light = look.known, look.light
-    field, pattern, specks = look.field_of(sample, deceived=True)
-    if specks:
+    field = look.field_of(sample)
+    if field.specks:
         # dust that is roughly known no longer passes for the particle, which may leave it free at times
-        known = averaged(field + pattern, cells)
-        dust = np.abs(averaged(pattern, cells))
+        dust = np.abs(averaged(field.pattern, cells))
+        known = averaged(field.surface + field.pattern, cells)
         look = _Look.at(logs, known, light, noise, _DEPTHS[-1], cells, dust)
-        field, pattern, specks = look.field_of(sample, deceived=False)
+        field = look.field_of(sample, field.specks)
     told = [image[np.isfinite(image)] for image in look.evened if np.isfinite(image).any()]
     return EmptyField(
-        log_light=field + pattern,
+        log_light=field.surface + field.pattern,
         light=look.light,
         outside=look.outside.mean(axis=0),
         depth=float(np.median([np.quantile(-values, 0.999) for values in told])),
         degree=look.degree,
-        specks=specks,
+        specks=field.covered,
     )
 
 
@@ -282,15 +282,10 @@ class _Look:
         known = field + _measured(mean - field, count, len(logs), noise)[0]
         return cls(light, levels, outside, evened, surface, degree, known)
 
-    def field_of(self, sample: Sample, *, deceived: bool) -> tuple[Stack, Stack, int]:
-        """Return the ``(H, W)`` surface, what it lacks, and the number of specks under the particle.
-
-        Where the particle makes up for a speck that is not known yet, a pixel looks free that isn't: such
-        measurements are not believed if `deceived`.
-        """
+    def field_of(self, sample: Sample, specks: list[Array] | None = None) -> _Field:
+        """Return the field in pixels; with `specks` that are roughly known, or else any that there are."""
         surface = self.surface.over(Cells(self.light.cells.shape)).astype(np.float32)
-        residuals = _Residuals(sample, surface, self.light, self.levels)
-        return surface, *_pattern(residuals, self.outside, deceived=deceived)
+        return _Field.of(surface, _Residuals(sample, surface, self.light, self.levels), self.outside, specks)
 
 
 @dataclass(frozen=True)
@@ -320,6 +315,65 @@ class _Residuals:
             logs -= self.field
             self.light.take_off(logs, level, pixels)
             yield logs
+
+
+@dataclass(frozen=True)
+class _Field:
+    """The field pixel by pixel.
+
+    Attributes
+    ----------
+    surface, pattern:
+        ``(H, W)`` what is smooth, and what that lacks: what is measured beside the particle, and specks.
+    specks, covered:
+        Specks, and how many of them are under the particle.
+    """
+
+    surface: Stack
+    pattern: Stack
+    specks: list[Array]
+    covered: int
+
+    @classmethod
+    def of(cls, surface: Stack, residuals: _Residuals, outside: Bools, known: list[Array] | None) -> Self:
+        """Measure what the particle leaves free, and find the specks elsewhere, or fit those `known` again."""
+        cells, count_of_frames = residuals.light.cells, len(outside)
+        free = (_in_pixels(image, cells) for image in outside)
+        hidden = _in_pixels(outside.mean(axis=0) < _DIRECT, cells)
+        rows, columns = _around(hidden)
+        height, width = hidden[rows, columns].shape
+        step = max(1, -(-4 * count_of_frames * height * width // _SPECK_BYTES))
+        kept = np.empty((-(-count_of_frames // step), height, width), np.float32)
+
+        def keeping() -> Iterator[Stack]:
+            for n, image in enumerate(residuals):
+                if n % step == 0:
+                    kept[n // step] = image[rows, columns]
+                yield image
+
+        direct, count = _mean_outside(keeping(), free, hidden.shape)
+        noise = _noise_of_pixels(residuals)
+        least = _DIRECT if known is None else _SELDOM
+        pattern, measured = _measured(direct, count, count_of_frames, noise, least)
+        if not hidden.any():
+            return cls(surface, pattern, [], 0)
+        corner = np.array([rows.start, columns.start, 0, 0])
+        believed, told = measured[rows, columns], pattern[rows, columns]
+        if known is None:
+            specks = find_specks(Standing.of(kept, noise), believed)
+        else:
+            standing = Standing.of(kept, noise, np.where(believed, told, np.nan))
+            specks = fit_again(standing, [speck - corner for speck in known])
+        under, fitted = covered(specks, believed), render(specks, believed.shape)
+        if known is None:
+            # a pixel that looks free when the particle happens to make up for a speck deceives
+            seen = count[rows, columns] >= _QUIET * count_of_frames
+            believed &= (np.abs(fitted) <= _FOOTPRINT) | seen
+        # what is measured in few frames only is told better by the specks than by nothing
+        direct, count = direct[rows, columns] - fitted, count[rows, columns]
+        more, _ = _measured(direct, count, count_of_frames, noise, least)
+        pattern[rows, columns] = fitted + np.where(believed, more, 0)
+        return cls(surface, pattern, [speck + corner for speck in specks], under)
 
 
 def grid(cells: Cells) -> tuple[int, ...]:
@@ -494,40 +548,6 @@ def _measured(
     spread = max(excess**2 - usual**2, 0.0)
     trust = np.where(clear, 1, spread / np.maximum(spread + scatter**2, _TINY))
     return np.where(measured, trust * direct, 0), measured
-
-
-def _pattern(residuals: _Residuals, outside: Bools, *, deceived: bool) -> tuple[Stack, int]:
-    """Return what the surface lacks in pixels: what is measured beside the particle, and specks under it."""
-    cells, count_of_frames = residuals.light.cells, len(outside)
-    free = (_in_pixels(image, cells) for image in outside)
-    hidden = _in_pixels(outside.mean(axis=0) < _DIRECT, cells)
-    rows, columns = _around(hidden)
-    height, width = hidden[rows, columns].shape
-    step = max(1, -(-4 * count_of_frames * height * width // _SPECK_BYTES))
-    kept = np.empty((-(-count_of_frames // step), height, width), np.float32)
-
-    def keeping() -> Iterator[Stack]:
-        for n, image in enumerate(residuals):
-            if n % step == 0:
-                kept[n // step] = image[rows, columns]
-            yield image
-
-    direct, count = _mean_outside(keeping(), free, hidden.shape)
-    noise = _noise_of_pixels(residuals)
-    least = _DIRECT if deceived else _SELDOM
-    pattern, measured = _measured(direct, count, count_of_frames, noise, least)
-    if not hidden.any():
-        return pattern, 0
-    believed, image = measured[rows, columns], pattern[rows, columns]
-    standing = Standing.of(kept, noise)
-    if not deceived:
-        kept[:, believed] = image[believed]
-        standing = replace(Standing.of(kept, noise, ~believed), drift=standing.drift)
-    specks, number = find_specks(standing, believed)
-    if deceived:
-        believed &= (np.abs(specks) <= _FOOTPRINT) | (count[rows, columns] >= _QUIET * count_of_frames)
-    pattern[rows, columns] = np.where(believed, pattern[rows, columns], specks)
-    return pattern, number
 
 
 def _around(hidden: Bools) -> tuple[slice, slice]:
