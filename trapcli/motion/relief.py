@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from trapcli.motion.low_band import LowBand
-from trapcli.motion.object_model import LOOSE, Assessment, Fit, refitted
+from trapcli.motion.object_model import LOOSE, Assessment, Fit, ObjectModel, refitted
 from trapcli.motion.path import Path, Spline, align, deviation
 from trapcli.motion.verdict import typical_error
 
@@ -29,6 +30,9 @@ _FACTORS = 2.0, 0.5, 4.0
 _WIDE = np.deg2rad(30.0), np.deg2rad(60.0)  # tilts beyond which views mostly and surely tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
+_FLAT = 0.5  # of the usual α, below which a path may go over into its mirror image
+_COARSE_BAND = 12.0  # band times radius of the object model that tells whether it may have
+_LIKELY = 1.1  # its misfit, in units of that of the path as it was
 _BETTER = 1.0  # gain that counts, in units of the misfit
 _SAME = 0.25  # mean angle between fits that are one motion, in units of its error
 _RULED_OUT = 9.0  # squares of standard deviations
@@ -125,6 +129,39 @@ def tilted(path: Path, factor: float, spline: Spline) -> Path:
     swing, spin, mean = _swings(ascending.R)
     R = mean @ Rotation.from_rotvec(factor * swing).as_matrix() @ spin
     return replace(ascending, R=R).near(spline, path.time)
+
+
+def untangled(fit: Fit, assessment: Assessment) -> Scored:
+    """Return the motion with parts that are mirror images turned back, if that is likelier.
+
+    Where an object hardly turns out of the image plane, a path may go over into its mirror image
+    (`Path.mirrored`) and come back a little later: what lies between two such places looks nearly alike.
+    """
+    best = fit, assessment
+    for _ in range(_MOST):
+        likely = [best[0].model.again(best[0], path) for path in _partly_mirrored(best[0])]
+        likelier = min(likely, key=lambda one: score(*one), default=best)
+        if score(*likelier) >= score(*best) - _BETTER:
+            break
+        best = likelier
+    return best
+
+
+def _partly_mirrored(fit: Fit) -> Iterator[Path]:
+    """Yield the path of a fit with a part mirrored where that explains the frames nearly as well."""
+    path = fit.path.ascending()
+    alpha = np.hypot(path.omega[:, 0], path.omega[:, 1])
+    middle = alpha[1:-1]
+    low = (middle <= alpha[:-2]) & (middle < alpha[2:]) & (middle < _FLAT * np.median(alpha))
+    if not low.any():
+        return
+    coarse = ObjectModel(fit.low, min(fit.model.band, _COARSE_BAND / fit.low.radius), guard=fit.model.guard)
+    whole = coarse.cost(fit.R, coarse.low.modes)
+    for first, last in pairwise([0, *(np.flatnonzero(low) + 1), len(alpha) - 1]):
+        other = path.mirrored(first).mirrored(last).near(fit.spline, fit.path.time)
+        rough = coarse.fit(other, fit.low.time, fit.spline, smooth=fit.roughness is not None)
+        if rough.cost <= _LIKELY * whole:
+            yield rough.path
 
 
 def _other_tilts(fit: Fit) -> Iterator[Path]:
