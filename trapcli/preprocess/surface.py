@@ -336,7 +336,7 @@ class _Field:
 
     @classmethod
     def of(cls, surface: Stack, residuals: _Residuals, outside: Bools, known: list[Array] | None) -> Self:
-        """Measure what the particle leaves free, and find the specks elsewhere, or fit those `known` again."""
+        """Measure what the particle leaves free; find the specks elsewhere, or fit those `known` again."""
         cells, count_of_frames = residuals.light.cells, len(outside)
         free = (_in_pixels(image, cells) for image in outside)
         hidden = _in_pixels(outside.mean(axis=0) < _DIRECT, cells)
@@ -358,20 +358,18 @@ class _Field:
         if not hidden.any():
             return cls(surface, pattern, [], 0)
         corner = np.array([rows.start, columns.start, 0, 0])
-        believed, told = measured[rows, columns], pattern[rows, columns]
+        believed, direct, count = measured[rows, columns], direct[rows, columns], count[rows, columns]
         if known is None:
             specks = find_specks(Standing.of(kept, noise), believed)
         else:
-            standing = Standing.of(kept, noise, np.where(believed, told, np.nan))
+            standing = Standing.of(kept, noise, np.where(believed, direct, np.nan))
             specks = fit_again(standing, [speck - corner for speck in known])
         under, fitted = covered(specks, believed), render(specks, believed.shape)
         if known is None:
             # a pixel that looks free when the particle happens to make up for a speck deceives
-            seen = count[rows, columns] >= _QUIET * count_of_frames
-            believed &= (np.abs(fitted) <= _FOOTPRINT) | seen
-        # what is measured in few frames only is told better by the specks than by nothing
-        direct, count = direct[rows, columns] - fitted, count[rows, columns]
-        more, _ = _measured(direct, count, count_of_frames, noise, least)
+            believed &= (np.abs(fitted) <= _FOOTPRINT) | (count >= _QUIET * count_of_frames)
+        # what few frames measure is told better by the specks than by nothing
+        more, _ = _measured(direct - fitted, count, count_of_frames, noise, least)
         pattern[rows, columns] = fitted + np.where(believed, more, 0)
         return cls(surface, pattern, [speck + corner for speck in specks], under)
 
@@ -431,15 +429,12 @@ def _outside(residual: Stack, noise: float, depth: float, dust: NDArray[Any] | N
     peak = float(np.median([np.quantile(np.abs(image), 0.999) for image in smooth]))
     least = max(_CLEAR * noise, depth * peak)
     inside = np.abs(smooth) > least
-    # where there is dust, what is darker than that alone is particle
-    free = ~inside.any(axis=0)
-    usual = float(np.median(_scatter(smooth[:, free][:, :: max(1, int(free.sum()) // _TYPICAL_CELLS)])))
+    free = smooth[:, ~inside.any(axis=0)]
+    usual = float(np.median(_scatter(free[:, :: max(1, free.shape[1] // _TYPICAL_CELLS)])))
     stuck = _stuck(inside, smooth, usual)
     if dust is not None:
-        near = ndimage.maximum_filter(dust, _PATCH)
-        uncovered, lightest = np.quantile(smooth[:, near > least], _ALONE, axis=0)
-        told = (np.abs(uncovered) < _MISFIT * near[near > least]) & (lightest - uncovered < _STILL * usual)
-        stuck[near > least] |= told
+        stuck |= _left_free(smooth, dust, least, usual)
+    # where there is dust, what is darker than that alone is particle
     alone = np.quantile(smooth[:, stuck], _ALONE[0], axis=0)
     inside[:, stuck] = np.abs(smooth[:, stuck] - alone) > least
     reach = 2 * max(2, round(_MARGIN * min(residual.shape[1:]))) + 1
@@ -451,7 +446,7 @@ def _outside(residual: Stack, noise: float, depth: float, dust: NDArray[Any] | N
 def _stuck(inside: Bools, smooth: Stack, usual: float) -> Bools:
     """Tell where there is dust, which is in all frames.
 
-    It is small beside the particle, or it stays as it is, but for `usual` noise, while something else changes.
+    It is small beside the particle, or it scatters no more than is `usual` while something else does.
     """
     labels, count = ndimage.label(inside.mean(axis=0) > _ALWAYS)
     sizes = np.bincount(labels.ravel())
@@ -465,7 +460,16 @@ def _stuck(inside: Bools, smooth: Stack, usual: float) -> Bools:
     if (~still[1:] & ~stuck[1:]).any():
         stuck |= still & (sizes < _HALF * whole)
     stuck[0] = False
-    return ndimage.binary_dilation(stuck[labels], iterations=_PATCH // 2)
+    return np.asarray(ndimage.binary_dilation(stuck[labels], iterations=_PATCH // 2))
+
+
+def _left_free(smooth: Stack, dust: NDArray[Any], least: float, usual: float) -> Bools:
+    """Tell where the particle at times leaves free dust that is roughly known: light, and still then."""
+    deep = ndimage.maximum_filter(dust, _PATCH)
+    near: Bools = deep > least
+    alone, lightest = np.quantile(smooth[:, near], _ALONE, axis=0)
+    near[near] = (np.abs(alone) < _MISFIT * deep[near]) & (lightest - alone < _STILL * usual)
+    return near
 
 
 def _scatter(series: Stack) -> Array:
