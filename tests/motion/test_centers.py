@@ -117,6 +117,18 @@ def test_noise_and_radius_of_a_ball() -> None:
     assert object_radius(images, 0.05) == pytest.approx(25, abs=2.1)
 
 
+def test_what_is_left_of_a_background_in_a_corner_is_no_part_of_the_object() -> None:
+    rng = np.random.default_rng(2)
+    rows, columns = np.mgrid[:128, :128] - 64
+    ball = np.sqrt(np.maximum(25**2 - rows**2 - columns**2, 0)) / 25
+    corner = 0.05 * np.exp(-((rows + 60) ** 2 + (columns + 58) ** 2) / (2 * 4.0**2))
+    images = ball + corner + 0.01 * rng.standard_normal((8, 128, 128))
+    assert object_radius(images, 0.01) == pytest.approx(25, abs=2.1)
+    # a part of the object may lie apart, if it is no mere remainder
+    images += 0.5 * (np.hypot(rows, columns - 50) < 8)
+    assert object_radius(images, 0.01) == pytest.approx(57.5, abs=5)
+
+
 def turning_grain(count: int, noise: float) -> np.ndarray:
     """An ellipsoid, whose edges are sharp, which turns by 0.3 degrees from frame to frame."""
     rows, columns = np.mgrid[:128, :128] - 64

@@ -130,6 +130,60 @@ def test_a_speck_under_a_round_particle_whose_mean_is_a_dome() -> None:
     assert np.abs(deviation(found.log_light, uneven() + hidden)).max() < 0.25 * np.abs(hidden).max()
 
 
+def rod(turns: np.ndarray) -> np.ndarray:
+    """Attenuation of a thin rod about the optical axis at ``(K,)`` angles."""
+    turn = turns[:, None, None]
+    x1 = np.cos(turn) * COLUMNS + np.sin(turn) * ROWS
+    x2 = np.cos(turn) * ROWS - np.sin(turn) * COLUMNS
+    return np.asarray(0.4 * np.sqrt(np.maximum(1 - (x1 / 28) ** 2 - (x2 / 6) ** 2, 0)))
+
+
+def with_rod(field: np.ndarray, turns: np.ndarray) -> EmptyField:
+    noise = NOISE * np.random.default_rng(6).standard_normal((FRAMES, SIZE, SIZE))
+    return fit_empty_field((field - rod(turns) + noise).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("place", "least"), [((-34, 20), 1.0), ((16, 10), 0.2)], ids=["never covered", "covered at times"]
+)
+def test_dust_as_large_as_a_part_of_the_particle_does_not_pass_for_it(
+    place: tuple[int, int], least: float
+) -> None:
+    turns = np.deg2rad(50) * np.sin(np.linspace(0, 4 * np.pi, FRAMES))
+    dust = speck(*place, size=2.4, depth=0.3)
+    found = with_rod(uneven() + dust, turns)
+    assert found.outside[place[0] + SIZE // 2, place[1] + SIZE // 2] >= least
+    near = np.hypot(ROWS - place[0], COLUMNS - place[1]) < 12
+    error = np.abs(deviation(found.log_light, uneven() + dust))[near]
+    assert error.max() < 6 * NOISE / np.sqrt(FRAMES * least)
+
+
+def test_a_part_of_the_particle_that_is_always_there_is_no_dust() -> None:
+    turns = np.deg2rad(4) * np.sin(np.linspace(0, 4 * np.pi, FRAMES))
+    dust = speck(-30, 20, size=2.0, depth=0.4)
+    found = with_rod(uneven() + dust, turns)
+    assert np.abs(deviation(found.log_light, uneven() + dust)).max() < 0.05
+    assert found.outside[SIZE // 2, SIZE // 2] == 0
+
+
+def test_specks_are_fitted_again_to_what_is_measured_beside_the_particle() -> None:
+    """The mean of what covers a speck in part is no paraboloid; beside it the field is known."""
+    noise = NOISE * np.random.default_rng(5).standard_normal((FRAMES, SIZE, SIZE))
+    edge = np.clip(COLUMNS / 6, 0, 1) ** 2
+    frames = (speck(4, 1, size=2.0) - 0.3 * edge + noise).astype(np.float32)
+    measured = np.where(COLUMNS < 1, speck(4, 1, size=2.0), np.nan)
+    known = [np.array([4.5 + SIZE // 2, 2.0 + SIZE // 2, 2.4, 0.5])]
+    plain, told = (
+        specks.fit_again(specks.Standing.of(frames, NOISE, image), known)[0] for image in (None, measured)
+    )
+    true = np.array([4.0 + SIZE // 2, 1.0 + SIZE // 2, 2.0, 0.4])
+    error = [
+        np.abs(specks.render([one], (SIZE, SIZE)) - speck(4, 1, size=2.0)).max() for one in (plain, told)
+    ]
+    assert error[1] < 0.04
+    assert error[0] > 2 * error[1]
+
+
 def test_what_drifts_with_the_particle_is_no_speck() -> None:
     carried = np.zeros((FRAMES, SIZE, SIZE), np.float32)
     for image, move in zip(carried, 3 * np.sin(np.arange(FRAMES) / 9), strict=True):

@@ -272,7 +272,7 @@ def _best_motion(
         if best is not None and _settled(*best, len(stack.low.time)):
             break
     assert best is not None
-    return best
+    return best if best[0].axes == (2,) else untangled(*best)
 
 
 def _quieter(
@@ -299,7 +299,6 @@ def _refined(
     found = [(fit, assessment)]
     model = fit.model
     if not (turns_in_plane or hopeless):
-        fit, assessment = untangled(fit, assessment)
         found = relieved(low, fit, assessment, len(time))
         fit, assessment = found[0]
         if not knots:
