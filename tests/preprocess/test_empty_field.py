@@ -176,7 +176,6 @@ def test_specks_are_fitted_again_to_what_is_measured_beside_the_particle() -> No
     plain, told = (
         specks.fit_again(specks.Standing.of(frames, NOISE, image), known)[0] for image in (None, measured)
     )
-    true = np.array([4.0 + SIZE // 2, 1.0 + SIZE // 2, 2.0, 0.4])
     error = [
         np.abs(specks.render([one], (SIZE, SIZE)) - speck(4, 1, size=2.0)).max() for one in (plain, told)
     ]
