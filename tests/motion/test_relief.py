@@ -13,7 +13,7 @@ import trapcli
 from tests.motion.test_object_model import FINE_BAND, FRAMES, RADIUS, low_band
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline, align, deviation
-from trapcli.motion.relief import relieved, score, tilt, tilted, widened
+from trapcli.motion.relief import relieved, score, tilt, tilted, untangled, widened
 from trapcli.simulation.phantoms import Blobs
 
 Array = NDArray[np.float64]
@@ -167,3 +167,23 @@ def test_small_swings_of_a_sharp_object_are_not_told_better_than_they_are() -> N
         truth = np.diag([1.0, 1.0, -1.0]) @ truth @ np.diag([1.0, 1.0, -1.0])
     error = Rotation.from_matrix(np.swapaxes(motion.R, 1, 2) @ truth).as_rotvec()
     assert np.mean(np.abs(error[1:]) < 2 * motion.R_errors[1:]) > 0.7
+
+
+def test_a_part_that_is_its_mirror_image_is_turned_over() -> None:
+    time = np.linspace(0, 1, 801)
+    # α is least at 0.2, 0.6 and 1, where ω₁ changes its sign
+    omega = np.stack([5 * np.cos(2.5 * np.pi * time), 0.6 + 0 * time, 2.5 * np.cos(3 * time)], axis=1)
+    true = Path.smooth(SPLINE, SPLINE.fit(time, omega), time)
+    path = true.near(SPLINE, TIMES)
+    thing = Blobs.random(np.random.default_rng(0), count=8, radius=RADIUS)
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    low = low_band(thing, views, 0, band=FINE_BAND, noise=0.02)
+    start = true.mirrored(160).mirrored(480).near(SPLINE, TIMES)
+    model = ObjectModel.likeliest(low, FINE_BAND, start.R[-FRAMES:])
+    tangled, right = (model.fit(one, GROUPS, SPLINE, steps=steps) for one, steps in ((start, 0), (path, 10)))
+    assert apart(tangled.path, path) > np.deg2rad(30)
+    best, told = untangled(tangled, model.assess(tangled))
+    assert apart(best.path, path) < np.deg2rad(1)
+    assert best.cost == pytest.approx(told.degrees, rel=0.05)
+    # the right motion is left as it is
+    assert untangled(right, model.assess(right))[0] is right
