@@ -30,6 +30,9 @@ _FACTORS = 2.0, 0.5, 4.0
 _WIDE = np.deg2rad(30.0), np.deg2rad(60.0)  # tilts beyond which views mostly and surely tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
+_TURNED = 3  # parts that are turned over at most
+_TRIED = 2  # of them at a time, by the fine model
+_UNNOTICED = np.deg2rad(3.0), np.deg2rad(90.0)  # least and largest turn out of the plane of such a part
 _FLAT = 0.5  # of the usual α, below which a path may go over into its mirror image
 _COARSE_BAND = 12.0  # band times radius of the object model that tells whether it may have
 _LIKELY = 1.1  # its misfit, in units of that of the path as it was
@@ -138,7 +141,7 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
     (`Path.mirrored`) and come back a little later: what lies between two such places looks nearly alike.
     """
     best = fit, assessment
-    for _ in range(_MOST):
+    for _ in range(_TURNED):
         likely = [best[0].model.again(best[0], path) for path in _partly_mirrored(best[0])]
         likelier = min(likely, key=lambda one: score(*one), default=best)
         if score(*likelier) >= score(*best) - _BETTER:
@@ -147,21 +150,28 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
     return best
 
 
-def _partly_mirrored(fit: Fit) -> Iterator[Path]:
-    """Yield the path of a fit with a part mirrored where that explains the frames nearly as well."""
+def _partly_mirrored(fit: Fit) -> list[Path]:
+    """Return the path of a fit with a part mirrored, for the few that explain the frames nearly as well."""
     path = fit.path.ascending()
     alpha = np.hypot(path.omega[:, 0], path.omega[:, 1])
     middle = alpha[1:-1]
     low = (middle <= alpha[:-2]) & (middle < alpha[2:]) & (middle < _FLAT * np.median(alpha))
     if not low.any():
-        return
+        return []
+    turned = np.concatenate([[0.0], np.cumsum(0.5 * (alpha[1:] + alpha[:-1]) * np.diff(path.time))])
+    places = [0]
+    for place in (*(np.flatnonzero(low) + 1), len(alpha) - 1):
+        if turned[place] - turned[places[-1]] > _UNNOTICED[0]:
+            places.append(place)
     coarse = ObjectModel(fit.low, min(fit.model.band, _COARSE_BAND / fit.low.radius), guard=fit.model.guard)
-    whole = coarse.cost(fit.R, coarse.low.modes)
-    for first, last in pairwise([0, *(np.flatnonzero(low) + 1), len(alpha) - 1]):
-        other = path.mirrored(first).mirrored(last).near(fit.spline, fit.path.time)
-        rough = coarse.fit(other, fit.low.time, fit.spline, smooth=fit.roughness is not None)
-        if rough.cost <= _LIKELY * whole:
-            yield rough.path
+    most = _LIKELY * coarse.cost(fit.R, coarse.low.modes)
+    rough = []
+    for first, last in pairwise(places):
+        if turned[last] - turned[first] <= _UNNOTICED[1]:
+            other = path.mirrored(first).mirrored(last).near(fit.spline, fit.path.time)
+            rough.append(coarse.fit(other, fit.low.time, fit.spline, smooth=fit.roughness is not None))
+    rough.sort(key=lambda one: one.cost)
+    return [one.path for one in rough[:_TRIED] if one.cost <= most]
 
 
 def _other_tilts(fit: Fit) -> Iterator[Path]:
