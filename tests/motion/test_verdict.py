@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 from trapcli.config import MotionConfig
 from trapcli.motion import joint, verdict
 from trapcli.motion.branch import find_branches
+from trapcli.motion.object_model import Assessment, Fit
 from trapcli.motion.path import align
 from trapcli.result.motion import Flag, Motion
 from trapcli.simulation.render import simulate
@@ -102,3 +105,21 @@ def test_errors_do_not_add_up_along_the_way() -> None:
     along = estimate(images, truth.time).R_errors[:, 0]
     third = len(along) // 3
     assert np.median(along[-third:]) < 1.2 * np.median(along[1:third])
+
+
+@pytest.mark.parametrize("spared", [False, True])
+def test_what_is_left_over_in_some_parts_only_is_no_imperfect_model(spared: bool) -> None:
+    rng = np.random.default_rng(0)
+    groups, modes = 100, 40
+    k = rng.normal(size=(modes, 2))
+    low = SimpleNamespace(k=k, modes=10 * rng.normal(size=(groups, modes)), variance=0.01)
+    misfit = np.full(groups, 1.2)
+    if spared:
+        misfit[:10] = 1.0
+    fit = SimpleNamespace(cost=misfit.mean() * 40_000, axes=(0, 1, 2), low=low)
+    assessment = SimpleNamespace(
+        degrees=40_000.0, frame_misfit=misfit, mode_misfit=np.full(modes, misfit.mean())
+    )
+    judged = verdict.judge(cast(Fit, fit), cast(Assessment, assessment))
+    assert judged.identifiable != spared
+    assert ("not everywhere" if spared else "imperfect model") in judged.text

@@ -37,6 +37,7 @@ from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
     COARSE,
     NOISE_ERROR,
+    PARTS,
     Stack,
     certified,
     judge,
@@ -91,7 +92,6 @@ _LEAST_SHARE = 0.25  # of the noise, to which it is lowered: of clean frames it 
 _NEARLY_PLANAR = 0.5  # share of ω₃ in α below which a rotation about the optical axis alone is tried
 _PATIENCE = 5.0  # of a look with a coarse model at such a rotation, in units of what noise gives
 _SETTLED = 1.03  # misfit per degree of freedom up to which no other motion is tried, if this one is told well
-_PARTS = 10  # of a stack, of which each must be explained
 _UNEVEN = 0.07  # share by which the misfit of one may be above that of most
 _WORSE = 2.5  # standard deviations by which the misfit of the finest fit may be above that of the one before
 _OUTLYING = 8.0  # misfit of a frame to its neighbours, in units of what is common, that makes it an outlier
@@ -369,8 +369,8 @@ def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
 
 def _even(assessment: Assessment) -> bool:
     """Tell whether all parts of the stack are explained alike: a motion may be wrong in one of them only."""
-    parts = np.array([part.mean() for part in np.array_split(assessment.frame_misfit, _PARTS)])
-    by_noise = _SIGNIFICANT * np.sqrt(2 * _PARTS / assessment.degrees)
+    parts = np.array([part.mean() for part in np.array_split(assessment.frame_misfit, PARTS)])
+    by_noise = _SIGNIFICANT * np.sqrt(2 * PARTS / assessment.degrees)
     return bool(parts.max() <= (1 + max(_UNEVEN, by_noise)) * np.median(parts))
 
 

@@ -28,6 +28,10 @@ NOISE_ERROR = 0.03
 
 _SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
+PARTS = 10
+"""Parts of a stack, of which each must be explained."""
+
+_SPARED = 0.1  # least misfit of one beyond the noise, as a share of that of most, that is the model's
 _STRONG = 12.0  # band times radius of the modes that misfits of frames are relative to
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 COARSE = np.deg2rad(1.0)
@@ -93,7 +97,7 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
     share = conjugate_share(fit.low.k)
     left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
     error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
-    if error <= _MODEL_ERROR:
+    if error <= _MODEL_ERROR and not _spared(assessment):
         return Verdict(
             True,
             f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
@@ -104,8 +108,17 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
     return Verdict(
         False,
         f"not trustworthy: no motion found explains the images; {100 * error:.0f} % of what changes in them "
-        f"is left over, {misfit:.1f} times the noise",
+        f"is left over, {misfit:.1f} times the noise{'' if error > _MODEL_ERROR else ', and not everywhere'}",
     )
+
+
+def _spared(assessment: Assessment) -> bool:
+    """Tell whether a part of the stack is explained while others are not.
+
+    What an imperfect model lacks shows everywhere; a wrong motion may be right in part.
+    """
+    excess = [float(part.mean()) - 1 for part in np.array_split(assessment.frame_misfit, PARTS)]
+    return bool(min(excess) < _SPARED * np.median(excess))
 
 
 def nothing_known(stack: Stack, text: str) -> Motion:
