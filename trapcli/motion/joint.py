@@ -39,6 +39,7 @@ from trapcli.motion.verdict import (
     NOISE_ERROR,
     PARTS,
     Stack,
+    by_parts,
     certified,
     judge,
     nothing_known,
@@ -369,7 +370,7 @@ def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
 
 def _even(assessment: Assessment) -> bool:
     """Tell whether all parts of the stack are explained alike: a motion may be wrong in one of them only."""
-    parts = np.array([part.mean() for part in np.array_split(assessment.frame_misfit, PARTS)])
+    parts = by_parts(assessment)
     by_noise = _SIGNIFICANT * np.sqrt(2 * PARTS / assessment.degrees)
     return bool(parts.max() <= (1 + max(_UNEVEN, by_noise)) * np.median(parts))
 

@@ -27,11 +27,13 @@ NOISE_ERROR = 0.03
 """How well the noise is known, as a share of its power."""
 
 _SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
+_CLEAR = 5.0  # the same of the misfit of one part of the stack
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
 PARTS = 10
 """Parts of a stack, of which each must be explained."""
 
-_SPARED = 0.1  # least misfit of one beyond the noise, as a share of that of most, that is the model's
+_SPARED = 0.1  # least misfit of one beyond the noise, as a share of the largest, that is the model's
+_SLIGHT = 0.005  # share of what changes that noise which is not the same all the time may leave
 _STRONG = 12.0  # band times radius of the modes that misfits of frames are relative to
 _FAINT = 2.0  # standard deviations below which α does not differ from 0
 COARSE = np.deg2rad(1.0)
@@ -79,9 +81,16 @@ class Verdict:
 
 
 def certified(fit: Fit, assessment: Assessment) -> bool:
-    """Tell whether noise alone explains the misfit."""
-    scatter = _SCATTER * np.sqrt(2 / assessment.degrees)
-    return bool(fit.cost <= max(_CERTIFIED, 1 + NOISE_ERROR + scatter) * assessment.degrees)
+    """Tell whether noise alone explains the misfit, in the whole and in each part."""
+    scatter = np.sqrt(2 / assessment.degrees)
+    limit = max(_CERTIFIED, 1 + NOISE_ERROR + _SCATTER * scatter)
+    worst = by_parts(assessment).max() - _CLEAR * scatter * np.sqrt(PARTS)
+    return bool(max(fit.cost / assessment.degrees, worst) <= limit)
+
+
+def by_parts(assessment: Assessment) -> Array:
+    """Return the misfit of each part of the stack."""
+    return np.array([part.mean() for part in np.array_split(assessment.frame_misfit, PARTS)])
 
 
 def judge(fit: Fit, assessment: Assessment) -> Verdict:
@@ -97,7 +106,7 @@ def judge(fit: Fit, assessment: Assessment) -> Verdict:
     share = conjugate_share(fit.low.k)
     left = float(np.sum(share * np.maximum(assessment.mode_misfit - 1, 0.0)) * fit.low.variance)
     error = float(np.sqrt(left / max(float(np.sum(share * changing.mean(axis=0))), 1e-300)))
-    if error <= _MODEL_ERROR and not _spared(assessment):
+    if error <= _SLIGHT or (error <= _MODEL_ERROR and not _spared(assessment)):
         return Verdict(
             True,
             f"the motion explains all but {100 * error:.1f} % of what changes in the images; the rest, "
@@ -117,8 +126,8 @@ def _spared(assessment: Assessment) -> bool:
 
     What an imperfect model lacks shows everywhere; a wrong motion may be right in part.
     """
-    excess = [float(part.mean()) - 1 for part in np.array_split(assessment.frame_misfit, PARTS)]
-    return bool(min(excess) < _SPARED * np.median(excess))
+    excess = by_parts(assessment) - 1
+    return bool(excess.min() < _SPARED * excess.max())
 
 
 def nothing_known(stack: Stack, text: str) -> Motion:
