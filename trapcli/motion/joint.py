@@ -37,7 +37,6 @@ from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
     COARSE,
     NOISE_ERROR,
-    PARTS,
     Stack,
     by_parts,
     certified,
@@ -55,7 +54,6 @@ ComplexArray = NDArray[np.complex128]
 
 _FEWEST = 12  # frames
 _LINE_BAND = 8.0  # band times radius for common lines
-_COARSE_BAND = 12.0  # band times radius of the object model while knots are chosen
 _NARROWEST_BAND = 16.0  # band times radius of the object model that tells motions apart, at least
 _FINE_BAND = 22.0  # the same at most
 _FINEST_BAND = 28.0  # the same in the end, where the object is as sharp as that
@@ -370,8 +368,7 @@ def _settled(fit: Fit, assessment: Assessment, n: int) -> bool:
 
 def _even(assessment: Assessment) -> bool:
     """Tell whether all parts of the stack are explained alike: a motion may be wrong in one of them only."""
-    parts = by_parts(assessment)
-    by_noise = _SIGNIFICANT * np.sqrt(2 * PARTS / assessment.degrees)
+    parts, by_noise = by_parts(assessment)
     return bool(parts.max() <= (1 + max(_UNEVEN, by_noise)) * np.median(parts))
 
 
@@ -495,7 +492,7 @@ def _coarse_fits(paths: list[Path], low: LowBand, time: Array, band: float, knot
     def light(fit: Fit) -> Fit:
         return replace(fit, known=None)  # normal equations of many motions would take much memory
 
-    model = ObjectModel(low, min(band, _COARSE_BAND / low.radius))
+    model = ObjectModel.coarse(low, band)
     first: list[Fit] = []
     finer: list[Spline] = []
     for path in paths:
@@ -533,7 +530,7 @@ def _simplest(model: ObjectModel, fit: Fit, assessment: Assessment) -> tuple[Fit
     if np.hypot(omega[0], omega[1]) >= _NEARLY_PLANAR * omega[2]:
         return fit, assessment
     # most rotations that are not about the optical axis alone show it at once
-    coarse = ObjectModel(model.low, min(model.band, _COARSE_BAND / model.low.radius), guard=model.guard)
+    coarse = ObjectModel.coarse(model.low, model.band, model.guard)
     rich = coarse.fit(fit.path, fit.low.time, fit.spline, smooth=fit.roughness is not None)
     if _planar(coarse, rich, coarse.assess(rich), _PATIENCE) is None:
         return fit, assessment

@@ -53,6 +53,7 @@ GUARDS = (3.0, 4.5, 6.0)
 LOOSE = 4.0
 """Variance of a prior over the likeliest: edges are no samples of it, and must not be smoothed away."""
 
+_COARSE_BAND = 12.0  # band times radius of a model that only tells right motions from wrong ones
 _MARGIN = 0.3  # lattice beyond the object's radius, in units of `spacing`
 _WIDTH = 0.4  # width of a blob in units of `spacing`, where it is not known
 _TYPICAL = 0.08, 0.02  # width of blobs over the object's radius, power over that of the strongest mode
@@ -212,6 +213,11 @@ class ObjectModel:
         middle = 2 * self._half * (edge**2 + edge + 1)
         self._difference = flat[:, None] - flat[None, :] + middle
         self._sum = flat[:, None] + flat[None, :] + middle
+
+    @classmethod
+    def coarse(cls, low: LowBand, band: float, guard: float = GUARDS[-1]) -> ObjectModel:
+        """Return a model that is quickly fitted, of `band` at most: it tells right motions from wrong."""
+        return cls(low, min(band, _COARSE_BAND / low.radius), guard=guard)
 
     @classmethod
     def after(cls, fit: Fit, assessment: Assessment, band: float) -> ObjectModel:

@@ -34,8 +34,7 @@ _TURNED = 3  # parts that are turned over at most
 _TRIED = 2  # of them at a time, by the fine model
 _UNNOTICED = np.deg2rad(3.0), np.deg2rad(90.0)  # least and largest turn out of the plane of such a part
 _FLAT = 0.5  # of the usual α, below which a path may go over into its mirror image
-_COARSE_BAND = 12.0  # band times radius of the object model that tells whether it may have
-_LIKELY = 1.1  # its misfit, in units of that of the path as it was
+_LIKELY = 1.1  # misfit of a coarse model, in units of that of the path as it was, up to which it may have
 _BETTER = 1.0  # gain that counts, in units of the misfit
 _SAME = 0.25  # mean angle between fits that are one motion, in units of its error
 _RULED_OUT = 9.0  # squares of standard deviations
@@ -163,7 +162,7 @@ def _partly_mirrored(fit: Fit) -> list[Path]:
     for place in (*(np.flatnonzero(low) + 1), len(alpha) - 1):
         if turned[place] - turned[places[-1]] > _UNNOTICED[0]:
             places.append(place)
-    coarse = ObjectModel(fit.low, min(fit.model.band, _COARSE_BAND / fit.low.radius), guard=fit.model.guard)
+    coarse = ObjectModel.coarse(fit.low, fit.model.band, fit.model.guard)
     most = _LIKELY * coarse.cost(fit.R, coarse.low.modes)
     rough = []
     for first, last in pairwise(places):

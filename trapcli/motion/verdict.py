@@ -29,9 +29,7 @@ NOISE_ERROR = 0.03
 _SCATTER = 3.0  # standard deviations of the misfit beside that, which tell where there are few
 _CLEAR = 5.0  # the same of the misfit of one part of the stack
 _MODEL_ERROR = 0.03  # misfit, as a share of what changes in the images, that an imperfect model may leave
-PARTS = 10
-"""Parts of a stack, of which each must be explained."""
-
+_PARTS = 10  # of a stack, of which each must be explained
 _SPARED = 0.1  # least misfit of one beyond the noise, as a share of the largest, that is the model's
 _SLIGHT = 0.005  # share of what changes that noise which is not the same all the time may leave
 _STRONG = 12.0  # band times radius of the modes that misfits of frames are relative to
@@ -82,15 +80,16 @@ class Verdict:
 
 def certified(fit: Fit, assessment: Assessment) -> bool:
     """Tell whether noise alone explains the misfit, in the whole and in each part."""
-    scatter = np.sqrt(2 / assessment.degrees)
-    limit = max(_CERTIFIED, 1 + NOISE_ERROR + _SCATTER * scatter)
-    worst = by_parts(assessment).max() - _CLEAR * scatter * np.sqrt(PARTS)
+    limit = max(_CERTIFIED, 1 + NOISE_ERROR + _SCATTER * np.sqrt(2 / assessment.degrees))
+    parts, by_noise = by_parts(assessment)
+    worst = parts.max() - by_noise
     return bool(max(fit.cost / assessment.degrees, worst) <= limit)
 
 
-def by_parts(assessment: Assessment) -> Array:
-    """Return the misfit of each part of the stack."""
-    return np.array([part.mean() for part in np.array_split(assessment.frame_misfit, PARTS)])
+def by_parts(assessment: Assessment) -> tuple[Array, float]:
+    """Return the misfit of each part of the stack, and by how much more it is no noise."""
+    parts = np.array([part.mean() for part in np.array_split(assessment.frame_misfit, _PARTS)])
+    return parts, float(_CLEAR * np.sqrt(2 * _PARTS / assessment.degrees))
 
 
 def judge(fit: Fit, assessment: Assessment) -> Verdict:
@@ -126,7 +125,7 @@ def _spared(assessment: Assessment) -> bool:
 
     What an imperfect model lacks shows everywhere; a wrong motion may be right in part.
     """
-    excess = by_parts(assessment) - 1
+    excess = by_parts(assessment)[0] - 1
     return bool(excess.min() < _SPARED * excess.max())
 
 

@@ -38,11 +38,11 @@ _DEPTHS = (0.1, 0.05, 0.02, 0.02)  # least depth of the particle in each round, 
 _CLEAR = 0.8  # the same in standard deviations of a cell: 4 of the mean over a patch
 _ALWAYS = 0.9  # share of the frames in which dust is seen
 _SMALL = 0.1  # its area as a share of the particle's
-_ALONE = 0.8, 0.95  # quantiles in time that dust is like while nothing covers it
-_MISFIT = 0.3  # of dust that is roughly known, as a share of its depth
 _HALF = 0.5  # the same at most where it stays as it is
 _STILL = 2.5  # scatter in time, in units of the empty field's, up to which it does
 _RIM = 0.95  # share of its cells that do
+_ALONE = 0.8, 0.95  # quantiles in time that dust is like while nothing covers it
+_MISFIT = 0.3  # of dust that is roughly known, as a share of its depth
 _MARGIN = 0.04  # width of the doubtful ring around the particle, as a share of the shorter edge
 _DIRECT = (
     0.25  # least share of frames in which a pixel that is measured directly lies outside of the particle
@@ -285,7 +285,7 @@ class _Look:
     def field_of(self, sample: Sample, specks: list[Array] | None = None) -> _Field:
         """Return the field in pixels; with `specks` that are roughly known, or else any that there are."""
         surface = self.surface.over(Cells(self.light.cells.shape)).astype(np.float32)
-        return _Field.of(surface, _Residuals(sample, surface, self.light, self.levels), self.outside, specks)
+        return _Field.of(_Residuals(sample, surface, self.light, self.levels), self.outside, specks)
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ class _Field:
     covered: int
 
     @classmethod
-    def of(cls, surface: Stack, residuals: _Residuals, outside: Bools, known: list[Array] | None) -> Self:
+    def of(cls, residuals: _Residuals, outside: Bools, known: list[Array] | None) -> Self:
         """Measure what the particle leaves free; find the specks elsewhere, or fit those `known` again."""
         cells, count_of_frames = residuals.light.cells, len(outside)
         free = (_in_pixels(image, cells) for image in outside)
@@ -356,7 +356,7 @@ class _Field:
         least = _DIRECT if known is None else _SELDOM
         pattern, measured = _measured(direct, count, count_of_frames, noise, least)
         if not hidden.any():
-            return cls(surface, pattern, [], 0)
+            return cls(residuals.field, pattern, [], 0)
         corner = np.array([rows.start, columns.start, 0, 0])
         believed, direct, count = measured[rows, columns], direct[rows, columns], count[rows, columns]
         if known is None:
@@ -371,7 +371,7 @@ class _Field:
         # what few frames measure is told better by the specks than by nothing
         more, _ = _measured(direct - fitted, count, count_of_frames, noise, least)
         pattern[rows, columns] = fitted + np.where(believed, more, 0)
-        return cls(surface, pattern, [speck + corner for speck in specks], under)
+        return cls(residuals.field, pattern, [speck + corner for speck in specks], under)
 
 
 def grid(cells: Cells) -> tuple[int, ...]:
