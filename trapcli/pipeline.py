@@ -162,7 +162,7 @@ def _without_dust(
 
     if found.best is None:
         return projections, found
-    motion, (fit, _), stack = found.motion(hidden=False), found.best, found.stack
+    motion, (fit, _), stack = found.so_far, found.best, found.stack
     center, best, cleared = stack.centers.center, (projections, found), projections
 
     def less(pattern: StandingPattern) -> Frames:
@@ -188,7 +188,7 @@ def _without_dust(
 
 def _better(best: tuple[Frames, Found], other: tuple[Frames, Found]) -> tuple[Frames, Found]:
     """Return the other one if it explains the images better and can be trusted as well."""
-    motion, again = (one[1].motion(hidden=False) for one in (best, other))
+    motion, again = (one[1].so_far for one in (best, other))
     both = np.isfinite(motion.residual) & np.isfinite(again.residual)
     better = np.mean(again.residual[both] ** 2) < np.mean(motion.residual[both] ** 2) if both.any() else False
     return other if better and again.identifiable >= motion.identifiable else best

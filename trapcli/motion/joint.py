@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,8 +122,16 @@ class Found:
     bands: tuple[float, float]
     knots: int
 
-    def motion(self, *, hidden: bool = True) -> Motion:
-        """Return the motion as it is; turns that a symmetry may hide are looked for if `hidden`."""
+    def motion(self) -> Motion:
+        """Return the motion as it is, once turns that a symmetry may hide have been looked for."""
+        return self._motion(hidden=True)
+
+    @cached_property
+    def so_far(self) -> Motion:
+        """The motion without that look."""
+        return self._motion(hidden=False)
+
+    def _motion(self, *, hidden: bool) -> Motion:
         if self.best is None:
             return nothing_known(
                 self.stack,
