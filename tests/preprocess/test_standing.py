@@ -113,7 +113,7 @@ def found_by(motion: Motion, *, residual: float, explains: bool) -> SimpleNamesp
     told = replace(motion, residual=np.full(len(motion), residual))
     low = SimpleNamespace(select=lambda _: None)
     return SimpleNamespace(
-        motion=lambda **_: told,
+        so_far=told,
         about=lambda _: None,
         best=(SimpleNamespace(model=None), None),
         stack=SimpleNamespace(

@@ -10,7 +10,7 @@ misfit claims less.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 
@@ -22,6 +22,7 @@ from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import LOOSE, Assessment, Fit, ObjectModel, refitted
 from trapcli.motion.path import Path, Spline, align, deviation
 from trapcli.motion.verdict import typical_error
+from trapcli.threads import in_parallel
 
 Array = NDArray[np.float64]
 Scored = tuple[Fit, Assessment]
@@ -34,6 +35,9 @@ _TURNED = 3  # parts that are turned over at most
 _TRIED = 2  # of them at a time, by the fine model
 _UNNOTICED = np.deg2rad(3.0), np.deg2rad(90.0)  # least and largest turn out of the plane of such a part
 _FLAT = 0.5  # of the usual α, below which a path may go over into its mirror image
+_STEP = np.deg2rad(15.0)  # rotation between places from which on it may be one
+_MOST_STEPS = 60  # of them at most
+_DIP = 0.3  # what a mirror image from there on misses, as a share of what it does from places to both sides
 _LIKELY = 1.1  # misfit of a coarse model, in units of that of the path as it was, up to which it may have
 _BETTER = 1.0  # gain that counts, in units of the misfit
 _SAME = 0.25  # mean angle between fits that are one motion, in units of its error
@@ -138,6 +142,8 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
 
     Where an object hardly turns out of the image plane, a path may go over into its mirror image
     (`Path.mirrored`) and come back a little later: what lies between two such places looks nearly alike.
+    That of an object with nearly a plane of symmetry may go over at any other place, and stay there: then
+    its mirror image from that place on explains much more than that from places before and after.
     """
     best = fit, assessment
     for _ in range(_TURNED):
@@ -152,25 +158,57 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
 def _partly_mirrored(fit: Fit) -> list[Path]:
     """Return the path of a fit with a part mirrored, for the few that explain the frames nearly as well."""
     path = fit.path.ascending()
+    coarse = ObjectModel.coarse(fit.low, fit.model.band, fit.model.guard)
+    as_it_is = coarse.cost(fit.R, coarse.low.modes)
+
+    def near(mirrored: Path) -> Path:
+        return mirrored.near(fit.spline, fit.path.time)
+
+    def excess(place: int) -> float:
+        R = near(path.mirrored(place)).R[-len(fit.low.time) :]
+        return coarse.cost(R, coarse.low.modes) - as_it_is
+
+    others = [path.mirrored(first).mirrored(last) for first, last in _flat_ends(path)]
+    others += [path.mirrored(place) for place in _crossings(path, excess)]
+    smooth = fit.roughness is not None
+    rough = [coarse.fit(near(other), fit.low.time, fit.spline, smooth=smooth) for other in others]
+    rough.sort(key=lambda one: one.cost)
+    return [one.path for one in rough[:_TRIED] if one.cost <= _LIKELY * as_it_is]
+
+
+def _flat_ends(path: Path) -> list[tuple[int, int]]:
+    """Return where parts begin and end, at both of which the object hardly turns out of the image plane."""
     alpha = np.hypot(path.omega[:, 0], path.omega[:, 1])
     middle = alpha[1:-1]
     low = (middle <= alpha[:-2]) & (middle < alpha[2:]) & (middle < _FLAT * np.median(alpha))
     if not low.any():
         return []
-    turned = np.concatenate([[0.0], np.cumsum(0.5 * (alpha[1:] + alpha[:-1]) * np.diff(path.time))])
+    turned = _turned(alpha, path.time)
     places = [0]
     for place in (*(np.flatnonzero(low) + 1), len(alpha) - 1):
         if turned[place] - turned[places[-1]] > _UNNOTICED[0]:
-            places.append(place)
-    coarse = ObjectModel.coarse(fit.low, fit.model.band, fit.model.guard)
-    most = _LIKELY * coarse.cost(fit.R, coarse.low.modes)
-    rough = []
-    for first, last in pairwise(places):
-        if turned[last] - turned[first] <= _UNNOTICED[1]:
-            other = path.mirrored(first).mirrored(last).near(fit.spline, fit.path.time)
-            rough.append(coarse.fit(other, fit.low.time, fit.spline, smooth=fit.roughness is not None))
-    rough.sort(key=lambda one: one.cost)
-    return [one.path for one in rough[:_TRIED] if one.cost <= most]
+            places.append(int(place))
+    return [pair for pair in pairwise(places) if turned[pair[1]] - turned[pair[0]] <= _UNNOTICED[1]]
+
+
+def _crossings(path: Path, excess: Callable[[int], float]) -> list[int]:
+    """Return from where on the mirror image explains much more than from elsewhere, by its misfit."""
+    turned = _turned(np.linalg.norm(path.omega, axis=1), path.time)
+    steps = min(round(turned[-1] / _STEP), _MOST_STEPS)
+    places = np.unique(np.searchsorted(turned, np.linspace(0, turned[-1], steps + 1)[1:-1]))
+    missed = np.array(in_parallel(excess, places.tolist()))
+    found = []
+    for k in range(1, len(places) - 1):
+        least = missed[k] <= min(missed[k - 1], missed[k + 1])
+        if least and missed[k] < _DIP * min(missed[:k].max(), missed[k + 1 :].max()):
+            found.append(k)
+    found.sort(key=lambda k: missed[k])
+    return [int(places[k]) for k in found[:_TRIED]]
+
+
+def _turned(speed: Array, time: Array) -> Array:
+    """Return the ``(N,)`` angles turned since the first time."""
+    return np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))])
 
 
 def _other_tilts(fit: Fit) -> Iterator[Path]:

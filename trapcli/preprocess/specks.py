@@ -23,7 +23,6 @@ Bools = NDArray[np.bool_]
 _CLEARLY_DARK = 0.1  # share of a frame's peak that belongs to the particle
 _PARTS = 8  # of the stack, in which a speck must be found
 _INDEPENDENT = 20  # projections that differ enough for their mean to have less variance by this factor
-_SELDOM = 20.0  # variance of what is measured beside it, in units of that of the mean of all frames
 _SHARP = (0.7, 3.0)  # widths of the two means between which a speck shows [pixels]
 _ROUND = 0.3  # least ratio of a speck's curvatures
 _SEEN = 4.0  # standard errors by which a candidate stands out
@@ -67,6 +66,8 @@ class Standing:
         ``(K, 2)`` by how much the particle is away from its mean place (rows, columns) [pixels].
     measured:
         ``(H, W)`` log(I / I₀) where it is known from frames that the particle leaves free there, else NaN.
+    often:
+        ``(H, W)`` share of the frames that do.
     """
 
     image: Array
@@ -74,13 +75,17 @@ class Standing:
     frames: Stack
     drift: Array
     measured: Array
+    often: Array
 
     @classmethod
-    def of(cls, frames: Stack, noise: float, measured: Array | None = None) -> Self:
+    def of(
+        cls, frames: Stack, noise: float, measured: Array | None = None, often: Array | None = None
+    ) -> Self:
         """Summarise ``(K, H, W)`` log(I / I₀) with pixel noise of a standard deviation `noise`."""
-        if measured is None:
-            measured = np.full(frames.shape[1:], np.nan)
-        return cls(_mean(frames), noise / np.sqrt(len(frames)), frames, _drift(frames), measured)
+        shape = frames.shape[1:]
+        measured = np.full(shape, np.nan) if measured is None else measured
+        often = np.ones(shape) if often is None else often
+        return cls(_mean(frames), noise / np.sqrt(len(frames)), frames, _drift(frames), measured, often)
 
     @property
     def hidden(self) -> Bools:
@@ -129,7 +134,7 @@ def find_specks(standing: Standing, free: Bools) -> list[Array]:
         found = False
         places = _candidates(standing, render(specks, shape), reach & ~refused)
         for place in places:
-            if any(np.hypot(*(speck[:2] - place)) < _APART for speck in specks):
+            if _is_near(specks, place, _APART):
                 continue
             if _add(specks, standing, place, places):
                 found = True
@@ -146,9 +151,15 @@ def fit_again(standing: Standing, specks: list[Array]) -> list[Array]:
     places = np.array([speck[:2] for speck in specks])
     again: list[Array] = []
     for speck in specks:
-        if not _add(again, standing, speck[:2], places):
+        fitted = _add(again, standing, speck[:2], places)
+        if not fitted and not _is_near(again, speck[:2], _APART):
             again.append(speck)
     return again
+
+
+def _is_near(specks: list[Array], place: Array, distance: float) -> bool:
+    """Tell whether any of several specks is less than a distance away from a place."""
+    return any(np.hypot(*(speck[:2] - place)) < distance for speck in specks)
 
 
 def _add(specks: list[Array], standing: Standing, place: Array, places: Array) -> bool:
@@ -331,12 +342,18 @@ def _fit(
     known = [specks[k] for k in near]
     x2, x1 = np.mgrid[rows, columns]
     keep = _own(x2, x1, place, places, known)
-    window = _Window(rows, columns, keep, _root_of_covariance(standing, rows, columns, keep))
+    covariance = _covariance(standing, rows, columns, keep)
+    window = _Window(rows, columns, keep, covariance.root())
     others = render([speck for k, speck in enumerate(specks) if k not in near], shape)
     sign = np.sign(_sharp(standing.image - others)[_pixel(place, shape)])
     target = window.of(standing.best - others)
     starts = [np.array([[*place, size, -0.1 * sign], *known]) for size in _SIZES]
     found = min((window.fit(start, target) for start in starts), key=lambda result: float(result.cost))
+    doubt = 2 * float(found.cost) / keep.sum()
+    if doubt > 1 and not standing.hidden[rows, columns][keep].all():
+        # the mean has more in it than changes tell, like the rim of a ball
+        window = _Window(rows, columns, keep, covariance.root(doubt))
+        found = window.fit(found.x.reshape(-1, 4), window.of(standing.best - others))
     frames = standing.seen(rows, columns) - others[rows, columns]
     series = window.white(frames[:, keep].T)
     # frames in which the particle is smooth here tell more
@@ -384,8 +401,21 @@ def _explained(series: Array, spot: Array) -> tuple[Array, Array]:
     return product / np.maximum(square, _NOTHING), 2 * share * product - share**2 * square
 
 
-def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> Array:
-    """Return the Cholesky factor of the covariance of the mean projection, its noise, and any paraboloid."""
+@dataclass(frozen=True)
+class _Covariance:
+    """``(P, P)`` covariance of the mean projection, and of what else there is."""
+
+    particle: Array
+    others: Array
+
+    def root(self, doubt: float = 1.0) -> Array:
+        """Return the Cholesky factor of the whole, with `doubt` times the projection's."""
+        whole = doubt * self.particle + self.others
+        return np.asarray(linalg.cholesky(whole, lower=True, check_finite=False))
+
+
+def _covariance(standing: Standing, rows: slice, columns: slice, keep: Bools) -> _Covariance:
+    """Return the covariance of the mean projection, and that of its noise and any paraboloid."""
     frames = standing.seen(rows, columns)
     height, width = frames.shape[1:]
     hidden = standing.hidden[rows, columns]
@@ -396,10 +426,9 @@ def _root_of_covariance(standing: Standing, rows: slice, columns: slice, keep: B
     x2, x1 = (axis[keep] for axis in np.mgrid[:height, :width])
     covariance = by_lag[x2[:, None] - x2, x1[:, None] - x1] / _INDEPENDENT
     covariance *= np.multiply.outer(hidden[keep], hidden[keep])
-    variance = standing.error**2 * np.where(hidden[keep], 1.0, _SELDOM)
-    covariance[np.diag_indices_from(covariance)] += variance + 1e-10
+    often = np.where(hidden, 1.0, standing.often[rows, columns])[keep]
+    variance = standing.error**2 / often
     right, down = (x1 - x1.mean()) / width, (x2 - x2.mean()) / height
     smooth = np.stack([np.ones(len(x1)), right, down, right**2, down**2, right * down], axis=1)
     smooth *= hidden[keep][:, None]
-    covariance += smooth @ smooth.T
-    return np.asarray(linalg.cholesky(covariance, lower=True, check_finite=False))
+    return _Covariance(covariance, smooth @ smooth.T + np.diag(variance + 1e-10))

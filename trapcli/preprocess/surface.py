@@ -40,6 +40,7 @@ _ALWAYS = 0.9  # share of the frames in which dust is seen
 _SMALL = 0.1  # its area as a share of the particle's
 _HALF = 0.5  # the same at most where it stays as it is
 _STILL = 2.5  # scatter in time, in units of the empty field's, up to which it does
+_NEVER = 1.5  # the same where nothing ever covers it
 _RIM = 0.95  # share of its cells that do
 _ALONE = 0.8, 0.95  # quantiles in time that dust is like while nothing covers it
 _MISFIT = 0.3  # of dust that is roughly known, as a share of its depth
@@ -362,7 +363,8 @@ class _Field:
         if known is None:
             specks = find_specks(Standing.of(kept, noise), believed)
         else:
-            standing = Standing.of(kept, noise, np.where(believed, direct, np.nan))
+            often = count / count_of_frames
+            standing = Standing.of(kept, noise, np.where(believed, direct, np.nan), often)
             specks = fit_again(standing, [speck - corner for speck in known])
         under, fitted = covered(specks, believed), render(specks, believed.shape)
         if known is None:
@@ -464,11 +466,16 @@ def _stuck(inside: Bools, smooth: Stack, usual: float) -> Bools:
 
 
 def _left_free(smooth: Stack, dust: NDArray[Any], least: float, usual: float) -> Bools:
-    """Tell where the particle at times leaves free dust that is roughly known: light, and still then."""
+    """Tell where the particle at times leaves free dust that is roughly known: light, and still then.
+
+    What is still all the time may be less well known: nothing covers it.
+    """
     deep = ndimage.maximum_filter(dust, _PATCH)
     near: Bools = deep > least
     alone, lightest = np.quantile(smooth[:, near], _ALONE, axis=0)
-    near[near] = (np.abs(alone) < _MISFIT * deep[near]) & (lightest - alone < _STILL * usual)
+    left = (np.abs(alone) < _MISFIT * deep[near]) & (lightest - alone < _STILL * usual)
+    left |= (np.abs(alone) < deep[near]) & (_scatter(smooth[:, near]) < _NEVER * usual)
+    near[near] = left
     return near
 
 
