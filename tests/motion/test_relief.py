@@ -187,3 +187,25 @@ def test_a_part_that_is_its_mirror_image_is_turned_over() -> None:
     assert best.cost == pytest.approx(told.degrees, rel=0.05)
     # the right motion is left as it is
     assert untangled(right, model.assess(right))[0] is right
+
+
+def test_a_path_that_ends_as_its_mirror_image_is_turned_over_where_alpha_is_not_small() -> None:
+    time = np.linspace(0, 1, 801)
+    # ω turns in the image plane, and α stays as it is
+    omega = np.stack([4 * np.cos(5 * time), 4 * np.sin(5 * time), 1.5 + 0 * time], axis=1)
+    true = Path.smooth(SPLINE, SPLINE.fit(time, omega), time)
+    path = true.near(SPLINE, TIMES)
+    # bent, and nearly its own mirror image
+    bent = np.linspace(-1, 1, 7)
+    place = RADIUS * np.stack([0.7 * bent, 0.5 * bent**2 - 0.2, 0.02 * np.sin(5 * bent)], axis=1)
+    size = np.array([0.1, 0.13, 0.09, 0.12, 0.1, 0.14, 0.11]) * RADIUS
+    thing = Blobs(np.linspace(0.6, 1.0, 7), place, size[:, None, None] ** 2 * np.eye(3))
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    low = low_band(thing, views, 0, band=FINE_BAND, noise=0.01)
+    start = true.mirrored(370).near(SPLINE, TIMES)
+    model = ObjectModel.likeliest(low, FINE_BAND, start.R[-FRAMES:])
+    tangled = model.fit(start, GROUPS, SPLINE, steps=0)
+    assert apart(tangled.path, path) > np.deg2rad(30)
+    best, told = untangled(tangled, model.assess(tangled))
+    assert apart(best.path, path) < np.deg2rad(1.5)
+    assert best.cost == pytest.approx(told.degrees, rel=0.05)
