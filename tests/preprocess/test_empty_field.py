@@ -183,6 +183,28 @@ def test_specks_are_fitted_again_to_what_is_measured_beside_the_particle() -> No
     assert error[0] > 2 * error[1]
 
 
+def test_a_speck_that_two_fits_lead_to_is_told_once() -> None:
+    noise = NOISE * np.random.default_rng(5).standard_normal((FRAMES, SIZE, SIZE))
+    particle = 0.3 * np.clip(COLUMNS / 20, 0, 1)
+    standing = specks.Standing.of((speck(4, -3, size=2.0) - particle + noise).astype(np.float32), NOISE)
+    here = np.array([4 + SIZE // 2, -3 + SIZE // 2, 2.0, 0.4])
+    again = specks.fit_again(standing, [here + [1.5, 0.0, 0.0, -0.39], here])
+    np.testing.assert_allclose(specks.render(again, (SIZE, SIZE)), speck(4, -3, size=2.0), atol=0.05)
+
+
+def test_a_speck_at_the_rim_of_a_ball_that_always_is_there() -> None:
+    """The rim of what is round hardly changes: how the mean looks there is not told by changes."""
+    turn = np.linspace(0, 3 * np.pi, FRAMES)[:, None, None]
+    outer, inner = (np.sqrt(np.maximum(r**2 - ROWS**2 - COLUMNS**2, 0)) / 20 for r in (20, 18))
+    spot = (ROWS - 17 * np.sin(turn)) ** 2 + (COLUMNS - 17 * np.cos(turn)) ** 2
+    ball = 0.3 * (outer - 0.7 * inner) + 0.12 * np.sqrt(np.maximum(1 - spot / 4**2, 0))
+    dust = speck(18, -16, size=2.4, depth=0.15)
+    noise = 0.02 * np.random.default_rng(8).standard_normal(ball.shape)
+    found = fit_empty_field((uneven() + dust - ball + noise).astype(np.float32))
+    near = np.hypot(ROWS - 18, COLUMNS + 16) < 8
+    assert np.abs(deviation(found.log_light, uneven() + dust))[near].max() < 0.2 * np.abs(dust).max()
+
+
 def test_what_drifts_with_the_particle_is_no_speck() -> None:
     carried = np.zeros((FRAMES, SIZE, SIZE), np.float32)
     for image, move in zip(carried, 3 * np.sin(np.arange(FRAMES) / 9), strict=True):
