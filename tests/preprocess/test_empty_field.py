@@ -188,7 +188,8 @@ def test_a_speck_that_two_fits_lead_to_is_told_once() -> None:
     particle = 0.3 * np.clip(COLUMNS / 20, 0, 1)
     standing = specks.Standing.of((speck(4, -3, size=2.0) - particle + noise).astype(np.float32), NOISE)
     here = np.array([4 + SIZE // 2, -3 + SIZE // 2, 2.0, 0.4])
-    again = specks.fit_again(standing, [here + [1.5, 0.0, 0.0, -0.39], here])
+    beside = here + np.array([1.5, 0.0, 0.0, -0.39])
+    again = specks.fit_again(standing, [beside, here])
     np.testing.assert_allclose(specks.render(again, (SIZE, SIZE)), speck(4, -3, size=2.0), atol=0.05)
 
 
