@@ -87,20 +87,27 @@ def test_the_prior_of_a_smooth_object_has_wider_blobs(path: Path) -> None:
 
 
 # blobs finer than the lattice, 0.08 over the radius, are beyond telling
-@pytest.mark.parametrize("width", [0.1, 0.2, 0.3])
-def test_the_width_of_blobs_is_told_by_the_power_of_the_modes(path: Path, width: float) -> None:
+@pytest.mark.parametrize("sharp", [True, False])
+@pytest.mark.parametrize("width", [0.15, 0.2, 0.3])
+def test_width_and_form_of_blobs_are_told_by_the_power_of_the_modes(
+    path: Path, width: float, sharp: bool
+) -> None:
     rng = np.random.default_rng(3)
     place = rng.normal(size=(300, 3))
     place *= 0.7 * RADIUS * rng.uniform(size=(300, 1)) ** (1 / 3) / np.linalg.norm(place, axis=1)[:, None]
-    points = Blobs(rng.normal(size=300), place, np.tile((1e-4 * RADIUS) ** 2 * np.eye(3), (300, 1, 1)))
+    amplitude = rng.normal(size=300)
+    amplitude -= place @ np.linalg.lstsq(place, amplitude, rcond=None)[0]  # its centre lies in the middle
+    points = Blobs(amplitude, place, np.tile((1e-4 * RADIUS) ** 2 * np.eye(3), (300, 1, 1)))
     low = low_band(points, path, 0, band=FINE_BAND, noise=1e-9)
-    modes = low.modes / (1 + np.sum((width * RADIUS * low.k) ** 2, axis=1))
+    square = np.sum((width * RADIUS * low.k) ** 2, axis=1)
+    modes = low.modes * (1 / (1 + square) if sharp else np.exp(-0.5 * square))
     sigma = 0.01 * np.abs(modes).max()
     white = sigma * (rng.normal(size=modes.shape) + 1j * rng.normal(size=modes.shape)) / np.sqrt(2)
     low = replace(low, modes=modes + white, variance=sigma**2)
     prior = ObjectModel.likeliest(low, FINE_BAND, path.R).prior
     assert prior is not None
     assert prior.width / RADIUS == pytest.approx(width, rel=0.5)
+    assert prior.sharp == sharp
 
 
 def test_the_slopes_of_what_the_frames_see_with_a_prior(path: Path) -> None:

@@ -161,7 +161,7 @@ class Found:
         low = _fine_groups(stack, self.pace)
         start = (path or fit.path).ascending()
         (coarse,) = _coarse_fits([start], low, time, fit.model.band, self.knots)
-        model = ObjectModel.likeliest(low, fit.model.band, coarse.R)
+        model = ObjectModel.likeliest(low, fit.model.band, coarse.R, sharp=fit.model.sharp)
         best = _fine_fit(coarse, model, smooth=not self.knots)
         stack, best = _quieter(stack, self.pace, *best)
         return replace(self, stack=stack, best=best)
@@ -351,8 +351,7 @@ def _uncrowded(fit: Fit, assessment: Assessment, time: Array) -> tuple[Fit, Asse
 def _told(fit: Fit) -> ObjectModel:
     """Return the model that the evidence at a motion tells: how large blobs are, how strong, and where.
 
-    Smooth objects are no samples of a field whose power has the form of that of edges: told in the whole
-    band, it may leave their fine parts too little. So low frequencies alone may tell it.
+    What lies at high frequencies is often no sample of what the low ones show. So these alone may tell it.
     """
     models = fit.model, fit.model.roughly_told(fit)
     return min(models, key=lambda model: model.score(fit)).placed(fit)

@@ -226,13 +226,19 @@ class ObjectModel:
         return cls(fit.low, band, guard=fit.model.guard, prior=fit.model.prior, variance=variance)
 
     @classmethod
-    def likeliest(cls, low: LowBand, band: float, R: Array, looseness: float = np.inf) -> ObjectModel:
+    def likeliest(
+        cls, low: LowBand, band: float, R: Array, looseness: float = np.inf, sharp: bool | None = None
+    ) -> ObjectModel:
         """Return the model that explains ``(G, 3, 3)`` rotations best, in as few amplitudes as it takes.
 
         The prior is told by its evidence on the finest lattice; the guard then by Akaike's criterion (1974,
         DOI 10.1109/TAC.1974.1100705): a smooth object needs a coarser lattice than one with sharp edges.
+        Whether the object is `sharp` is told by its evidence as well, where that is not known.
         """
-        prior = replace(cls._likeliest_prior(low, band, GUARDS[-1], R), looseness=looseness)
+        forms = (True, False) if sharp is None else (sharp,)
+        told = [cls._likeliest_prior(low, band, GUARDS[-1], R, sharp=form) for form in forms]
+        prior, _ = min(told, key=lambda one: one[1])
+        prior = replace(prior, looseness=looseness)
 
         def surprise(model: ObjectModel) -> float:
             views = model.views(R)
@@ -243,9 +249,17 @@ class ObjectModel:
 
     @classmethod
     def _likeliest_prior(
-        cls, low: LowBand, band: float, guard: float, R: Array, rounds: int = len(_SEARCH)
-    ) -> Prior:
-        about = Prior.of(low)
+        cls,
+        low: LowBand,
+        band: float,
+        guard: float,
+        R: Array,
+        *,
+        sharp: bool,
+        rounds: int = len(_SEARCH),
+    ) -> tuple[Prior, float]:
+        """Return the likeliest prior of a form, and how surprising the frames are with it."""
+        about = Prior.of(low, sharp=sharp)
 
         def prior(logarithms: Array) -> Prior:
             width, power = np.exp(logarithms)
@@ -258,7 +272,7 @@ class ObjectModel:
 
         best = np.log(_TYPICAL)
         for highest, spread, looks in _SEARCH[:rounds]:
-            best = minimize(
+            found = minimize(
                 surprise,
                 best,
                 args=(min(band, highest / low.radius),),
@@ -270,14 +284,16 @@ class ObjectModel:
                     "fatol": 1.0,
                     "maxfev": looks,
                 },
-            ).x
-        found = prior(best)
-        return replace(found, power=LOOSE * found.power)
+            )
+            best = found.x
+        likeliest = prior(best)
+        return replace(likeliest, power=LOOSE * likeliest.power), float(found.fun)
 
     def roughly_told(self, fit: Fit) -> ObjectModel:
         """Return the model whose prior low frequencies alone tell, and from there the others by its form."""
         assert self.prior is not None
-        prior = self._likeliest_prior(self.low, self.band, self.guard, fit.R, rounds=1)
+        sharp = self.prior.sharp
+        prior, _ = self._likeliest_prior(self.low, self.band, self.guard, fit.R, sharp=sharp, rounds=1)
         return self._with(replace(prior, looseness=self.prior.looseness))
 
     def placed(self, fit: Fit) -> ObjectModel:
@@ -302,6 +318,11 @@ class ObjectModel:
 
     def _with(self, prior: Prior) -> ObjectModel:
         return ObjectModel(self.low, self.band, guard=self.guard, prior=prior, variance=self.variance)
+
+    @property
+    def sharp(self) -> bool | None:
+        """Whether the object is taken to have edges; None where nothing is known of it."""
+        return None if self.prior is None else self.prior.sharp
 
     @property
     def data_count(self) -> float:
@@ -732,7 +753,8 @@ def refitted(low: LowBand, fit: Fit, path: Path, looseness: float = np.inf) -> t
     looseness:
         Of the prior.
     """
-    model = ObjectModel.likeliest(low, fit.model.band, path.R[-len(low.time) :], looseness)
+    R = path.R[-len(low.time) :]
+    model = ObjectModel.likeliest(low, fit.model.band, R, looseness, fit.model.sharp)
     return model.again(fit, path)
 
 

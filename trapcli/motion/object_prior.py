@@ -10,8 +10,10 @@ variance of amplitudes there becomes the mean square of those that the frames de
 above). Most of a ball about an object is empty, and what is empty needs no amplitudes.
 
 What lies inside edges has a power that falls as k⁻⁴, that of a random medium of two densities as
-(1 + w²k²)⁻² (Debye, Anderson and Brumberger 1957, DOI 10.1063/1.1722830). Blobs have this power: where it is
-taken to fall faster, sharp objects seem to turn less than they do.
+(1 + w²k²)⁻² (Debye, Anderson and Brumberger 1957, DOI 10.1063/1.1722830). That of smooth objects falls late
+and then fast: as a Gaussian, say. Where it is taken to fall faster than it does, sharp objects seem to turn
+less than they do; where slower, amplitudes are free to follow the noise. Blobs have the one power or the
+other, which the evidence tells as well.
 """
 
 from __future__ import annotations
@@ -42,9 +44,11 @@ class Prior:
     distance, density:
         ``(M,)`` distances from the centre [length] and the variance of amplitudes there, up to a factor.
     width:
-        Length w on which a blob falls off, as exp(−r / w) / r [length].
+        Length w on which a blob falls off, as exp(−r / w) / r if it is sharp, else exp(−r² / 2 w²) [length].
     power:
         Variance of a mode of the object at k = 0.
+    sharp:
+        Whether the power is that of edges rather than of smooth objects.
     looseness:
         Variance over the likeliest one, if what the object itself adds to the misfit is to count.
     place, share, vicinity:
@@ -56,20 +60,21 @@ class Prior:
     density: Array
     width: float
     power: float
+    sharp: bool = True
     looseness: float = np.inf
     place: Array | None = None
     share: Array | None = None
     vicinity: float = 0.0
 
     @classmethod
-    def of(cls, low: LowBand) -> Prior:
+    def of(cls, low: LowBand, *, sharp: bool = True) -> Prior:
         """Return a prior with the radial density that the frames show, and blobs as small as may be."""
         distance = np.linspace(0.0, low.radius, _SHELLS)
         density = np.abs(radial_density(low, distance))
         # an object may be hollow, or dark at its rim and bright inside
         density = np.maximum.accumulate(density[::-1])[::-1]
         power = float(np.max(np.mean(np.abs(low.modes) ** 2, axis=0)))
-        return cls(distance, np.maximum(density / density[0], _LEAST), 0.0, power)
+        return cls(distance, np.maximum(density / density[0], _LEAST), 0.0, power, sharp)
 
     @classmethod
     def vague(cls, low: LowBand, width: float, noise: Array) -> Prior:
@@ -117,7 +122,8 @@ class Prior:
 
     def spectrum(self, k: Array) -> Array:
         """Return standard deviations of modes at spatial frequencies of length `k` [rad / length]."""
-        return np.asarray(np.sqrt(self.power) / (1 + (self.width * k) ** 2))
+        square = (self.width * k) ** 2
+        return np.asarray(np.sqrt(self.power) * (1 / (1 + square) if self.sharp else np.exp(-0.5 * square)))
 
 
 def radial_density(low: LowBand, distance: Array) -> Array:
