@@ -103,17 +103,20 @@ def unseen_turn(fit: Fit, assessment: Assessment, band: float) -> UnseenTurn | N
     # what the lower half of the band tells apart needs no finer look
     models = [ObjectModel.after(centred, assessment, share * band) for share in (0.5, 1.0)]
     rivals = _Rivals(centred, models)
-    axis = _axis_of_revolution(models[0], R, _least_resisted_axes(fit, assessment))
+    axis = _axis_of_revolution(models[0], R, least_resisted_axes(fit, assessment))
     if axis is not None:
         spin = _SPIN * (fit.path.time - fit.path.time.mean()) / np.ptp(fit.path.time)
         # where a spin is unseen, each parameter has found the best of all values, not only of those close by
-        if rivals.as_good(_spun(fit.path, axis, spin), _BEST_OF_MANY * fit.spline.size):
+        if rivals.as_good(spun(fit.path, axis, spin), _BEST_OF_MANY * fit.spline.size):
             return UnseenTurn(axis, 0.0)
     return _other_symmetry(fit, models[0], rivals)
 
 
-def _least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:
-    """Return ``(3, 3)`` axes of the object as rows, that of the spin which changes the misfit least first."""
+def least_resisted_axes(fit: Fit, assessment: Assessment) -> Array:
+    """Return ``(3, 3)`` axes of the object as rows, that of the spin which changes the misfit least first.
+
+    By the curvature of the misfit at a fit.
+    """
     values = fit.spline.values(fit.low.time)
     ramp = np.linspace(-0.5, 0.5, len(values))
     spins = [
@@ -157,7 +160,7 @@ def _other_symmetry(fit: Fit, coarse: ObjectModel, rivals: _Rivals) -> UnseenTur
     angle[order] = np.unwrap(np.arctan2(gamma @ np.cross(axis, first), gamma @ first)[order])
     turned = float(np.ptp(angle))
     factors = [factor for factor in _SYMMETRY_FACTORS if abs(factor - 1) * turned > _LEAST]
-    others = [_spun(fit.path, axis, float(factor - 1) * (angle - angle.mean())) for factor in factors]
+    others = [spun(fit.path, axis, float(factor - 1) * (angle - angle.mean())) for factor in factors]
     groups = len(fit.low.time)
     own = coarse.cost(fit.R, coarse.low.modes)
     rise = np.array([coarse.cost(other.R[-groups:], coarse.low.modes) - own for other in others])
@@ -204,8 +207,8 @@ class _Rivals:
         return refined.path, refined.cost, model.assess(refined).degrees
 
 
-def _spun(path: Path, axis: Array, angle: Array) -> Path:
-    """Return the path with the object turned by `angle` about one of its axes in addition."""
+def spun(path: Path, axis: Array, angle: Array) -> Path:
+    """Return the path with the object turned by ``(M,)`` angles about one of its axes in addition [rad]."""
     order = np.argsort(path.time, kind="stable")
     time, first = np.unique(path.time[order], return_index=True)
     rate = CubicSpline(time, angle[order][first])(path.time, 1)

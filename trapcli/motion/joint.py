@@ -33,7 +33,7 @@ from trapcli.motion.low_band import LowBand, group_means
 from trapcli.motion.moments import MomentTable
 from trapcli.motion.object_model import Assessment, Fit, ObjectModel, refitted
 from trapcli.motion.path import Path, Spline, align
-from trapcli.motion.relief import relieved, score, untangled, widened
+from trapcli.motion.relief import relieved, score, unspun, untangled, widened
 from trapcli.motion.types import ReducedMap
 from trapcli.motion.verdict import (
     COARSE,
@@ -307,6 +307,7 @@ def _refined(
     found = [(fit, assessment)]
     model = fit.model
     if not (turns_in_plane or hopeless):
+        fit, assessment = unspun(fit, assessment)
         found = relieved(low, fit, assessment, len(time))
         fit, assessment = found[0]
         if not knots:

@@ -6,6 +6,9 @@ an object may be like differs between them; a search downhill stays in the one t
 the motion is tilted more and less, and fitted again each time with the object's model that suits it. What of
 these explains the frames nearly as well as the best tells how far that may be off, where the curvature of its
 misfit claims less.
+
+Parts of a path may be mirror images, and what is long may turn otherwise about its length: these are tried as
+well.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from trapcli.motion.ambiguity import least_resisted_axes, spun
 from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_model import LOOSE, Assessment, Fit, ObjectModel, refitted
 from trapcli.motion.path import Path, Spline, align, deviation
@@ -31,13 +35,16 @@ _FACTORS = 2.0, 0.5, 4.0
 _WIDE = np.deg2rad(30.0), np.deg2rad(60.0)  # tilts beyond which views mostly and surely tell it
 _MOST = 6  # times that a better tilt is followed
 _HOPELESS = 1.25  # misfit of a tilted motion before it is fitted, in units of the best's
-_TURNED = 3  # parts that are turned over at most
+_ROUNDS = 3  # parts that are turned over, or spins that are changed, at most
 _TRIED = 2  # of them at a time, by the fine model
 _UNNOTICED = np.deg2rad(3.0), np.deg2rad(90.0)  # least and largest turn out of the plane of such a part
 _FLAT = 0.5  # of the usual α, below which a path may go over into its mirror image
 _STEP = np.deg2rad(15.0)  # rotation between places from which on it may be one
 _MOST_STEPS = 60  # of them at most
 _DIP = 0.3  # what a mirror image from there on misses, as a share of what it does from places to both sides
+_SPINS = tuple(np.deg2rad([-60.0, -30.0, 30.0, 60.0]))  # in the whole stack that are tried
+_ELONGATED = 0.3  # resistance to a spin, in units of that about other axes, up to which it may be a wrong one
+_OTHER = np.deg2rad(2.0)  # largest angle between motions from which on they are not one
 _LIKELY = 1.1  # misfit of a coarse model, in units of that of the path as it was, up to which it may have
 _BETTER = 1.0  # gain that counts, in units of the misfit
 _SAME = 0.25  # mean angle between fits that are one motion, in units of its error
@@ -145,9 +152,21 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
     That of an object with nearly a plane of symmetry may go over at any other place, and stay there: then
     its mirror image from that place on explains much more than that from places before and after.
     """
-    best = fit, assessment
-    for _ in range(_TURNED):
-        likely = [best[0].model.again(best[0], path) for path in _partly_mirrored(best[0])]
+    return _likeliest((fit, assessment), _partly_mirrored)
+
+
+def unspun(fit: Fit, assessment: Assessment) -> Scored:
+    """Return the motion with another spin of the object about its length, if that is likelier.
+
+    How far what is long turns about its length shows little: the misfit has several minima along that way.
+    """
+    return _likeliest((fit, assessment), _otherwise_spun)
+
+
+def _likeliest(best: Scored, others: Callable[[Fit, Assessment], list[Path]]) -> Scored:
+    """Fit from other paths again and again, as long as that gains."""
+    for _ in range(_ROUNDS):
+        likely = [best[0].model.again(best[0], path) for path in others(*best)]
         likelier = min(likely, key=lambda one: score(*one), default=best)
         if score(*likelier) >= score(*best) - _BETTER:
             break
@@ -155,7 +174,7 @@ def untangled(fit: Fit, assessment: Assessment) -> Scored:
     return best
 
 
-def _partly_mirrored(fit: Fit) -> list[Path]:
+def _partly_mirrored(fit: Fit, _: Assessment) -> list[Path]:
     """Return the path of a fit with a part mirrored, for the few that explain the frames nearly as well."""
     path = fit.path.ascending()
     coarse = ObjectModel.coarse(fit.low, fit.model.band, fit.model.guard)
@@ -170,10 +189,29 @@ def _partly_mirrored(fit: Fit) -> list[Path]:
 
     others = [path.mirrored(first).mirrored(last) for first, last in _flat_ends(path)]
     others += [path.mirrored(place) for place in _crossings(path, excess)]
-    smooth = fit.roughness is not None
-    rough = [coarse.fit(near(other), fit.low.time, fit.spline, smooth=smooth) for other in others]
-    rough.sort(key=lambda one: one.cost)
-    return [one.path for one in rough[:_TRIED] if one.cost <= _LIKELY * as_it_is]
+    return _nearly_as_good(fit, coarse, [near(other) for other in others])
+
+
+def _otherwise_spun(fit: Fit, assessment: Assessment) -> list[Path]:
+    """Return the path of a fit with other spins, if these are seen far less than those about other axes."""
+    coarse = ObjectModel.coarse(fit.low, fit.model.band, fit.model.guard)
+    as_it_is = coarse.cost(fit.R, coarse.low.modes)
+    progress = (fit.path.time - fit.path.time.mean()) / np.ptp(fit.path.time)
+    axes = least_resisted_axes(fit, assessment)
+    others = [[spun(fit.path, axis, spin * progress) for spin in _SPINS] for axis in axes[:2]]
+    groups = len(fit.low.time)
+    missed = [[coarse.cost(other.R[-groups:], coarse.low.modes) for other in about] for about in others]
+    least, more = np.mean(missed, axis=1) - as_it_is
+    return _nearly_as_good(fit, coarse, others[0]) if least <= _ELONGATED * more else []
+
+
+def _nearly_as_good(fit: Fit, coarse: ObjectModel, starts: list[Path]) -> list[Path]:
+    """Return where a coarse model leads from other paths, the few that explain the frames nearly as well."""
+    as_it_is, smooth = coarse.cost(fit.R, coarse.low.modes), fit.roughness is not None
+    found = [coarse.fit(start, fit.low.time, fit.spline, smooth=smooth) for start in starts]
+    others = [one for one in found if align(one.R, fit.R)[0].max() > _OTHER]
+    others.sort(key=lambda one: one.cost)
+    return [one.path for one in others[:_TRIED] if one.cost <= _LIKELY * as_it_is]
 
 
 def _flat_ends(path: Path) -> list[tuple[int, int]]:
