@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 import trapcli
 from tests.motion.test_object_model import FINE_BAND, FRAMES, RADIUS, low_band
+from trapcli.motion.ambiguity import spun
 from trapcli.motion.object_model import ObjectModel
 from trapcli.motion.path import Path, Spline, align, deviation
-from trapcli.motion.relief import relieved, score, tilt, tilted, untangled, widened
+from trapcli.motion.relief import relieved, score, tilt, tilted, unspun, untangled, widened
 from trapcli.simulation.phantoms import Blobs
 
 Array = NDArray[np.float64]
@@ -209,3 +210,29 @@ def test_a_path_that_ends_as_its_mirror_image_is_turned_over_where_alpha_is_not_
     best, told = untangled(tangled, model.assess(tangled))
     assert apart(best.path, path) < np.deg2rad(1.5)
     assert best.cost == pytest.approx(told.degrees, rel=0.05)
+
+
+@pytest.mark.slow
+def test_what_is_long_is_turned_about_its_length_where_a_search_downhill_stays() -> None:
+    time = np.linspace(0, 1, 801)
+    omega = np.stack([4 * np.cos(3 * time), 4 * np.sin(3 * time) + 1, 2 + 2 * np.cos(5 * time)], axis=1)
+    path = Path.smooth(SPLINE, SPLINE.fit(time, omega), time).near(SPLINE, TIMES)
+    rng = np.random.default_rng(4)
+    height, angle = rng.uniform(-0.7, 0.7, 8), rng.uniform(0, 2 * np.pi, 8)
+    # a rod, with small bodies about it
+    rod = np.linspace(-0.75, 0.75, 9)[:, None] * np.array([0.0, 0.0, 1.0])
+    about = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), height], axis=1)
+    turn = Rotation.from_euler("zy", [47, 61], degrees=True).as_matrix().T
+    size = RADIUS * np.concatenate([np.full(9, 0.12), np.full(8, 0.05)])
+    place = RADIUS * np.concatenate([rod, about]) @ turn
+    thing = Blobs(np.repeat([1.0, 2.0], [9, 8]), place, size[:, None, None] ** 2 * np.eye(3))
+    views = Path(GROUPS, path.R[-FRAMES:], path.omega[-FRAMES:])
+    low = low_band(thing, views, 0, band=FINE_BAND, noise=0.003)
+    start = spun(path, turn[2], np.deg2rad(-120) * (TIMES - 0.5))
+    fit = ObjectModel.likeliest(low, FINE_BAND, start.R[-FRAMES:]).fit(start, GROUPS, SPLINE)
+    assert apart(fit.path, path) > np.deg2rad(10)
+    best, told = unspun(fit, fit.model.assess(fit))
+    assert apart(best.path, path) < np.deg2rad(0.5)
+    assert best.cost == pytest.approx(told.degrees, rel=0.05)
+    # the right motion is left as it is
+    assert unspun(best, told)[0] is best
