@@ -102,7 +102,7 @@ def test_commands_print_what_the_pages_show(tmp_path: Path) -> None:
                 assert reader.python(block, page.name)
             elif language == "console":
                 found = reader.follow(block)
-                assert words(found) == words(block), page
+                assert words(found) == words(block), f"{page}: {found}"
                 # the last digits depend on the processor
                 shown = np.array(numbers(block))
                 np.testing.assert_allclose(numbers(found), shown, rtol=0.3, atol=0.02, err_msg=found)
