@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -13,9 +14,13 @@ T = TypeVar("T")
 
 _ARENA_MAX = -8  # parameter of glibc's mallopt
 
+_mine = threading.local()
+
 
 def processors() -> int:
-    """Return how many threads to use: ``OMP_NUM_THREADS``, or what this process may."""
+    """Return how many threads to use: ``OMP_NUM_THREADS``, or what this process may, shared by threads."""
+    if share := getattr(_mine, "share", 0):
+        return int(share)
     try:
         return max(1, int(os.environ["OMP_NUM_THREADS"]))
     except (KeyError, ValueError):
@@ -24,10 +29,17 @@ def processors() -> int:
 
 def in_parallel(function: Callable[..., T], *arguments: Iterable[Any]) -> list[T]:
     """Return what ``map`` does, from as many threads as may be used; for work that frees the interpreter."""
-    if processors() == 1:
-        return list(map(function, *arguments))
-    with ThreadPoolExecutor(processors()) as threads:
-        return list(threads.map(function, *arguments))
+    items, threads = list(zip(*arguments, strict=False)), processors()
+    if threads == 1:
+        return [function(*item) for item in items]
+    share = max(1, threads // max(1, len(items)))
+
+    def work(item: tuple[Any, ...]) -> T:
+        _mine.share = share
+        return function(*item)
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, items))
 
 
 def share_memory() -> None:

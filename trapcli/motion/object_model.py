@@ -42,7 +42,7 @@ from trapcli.motion.low_band import LowBand
 from trapcli.motion.object_prior import Prior
 from trapcli.motion.path import Path, Spline, cross_matrix
 from trapcli.motion.roughness import Roughness
-from trapcli.threads import in_parallel
+from trapcli.threads import in_parallel, processors
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -236,7 +236,7 @@ class ObjectModel:
         Whether the object is `sharp` is told by its evidence as well, where that is not known.
         """
         forms = (True, False) if sharp is None else (sharp,)
-        told = [cls._likeliest_prior(low, band, GUARDS[-1], R, sharp=form) for form in forms]
+        told = in_parallel(lambda form: cls._likeliest_prior(low, band, GUARDS[-1], R, sharp=form), forms)
         prior, _ = min(told, key=lambda one: one[1])
         prior = replace(prior, looseness=looseness)
 
@@ -711,8 +711,12 @@ class ObjectModel:
 
     def _columns(self, views: Views, whitened: ComplexArray) -> Iterator[tuple[slice, Array]]:
         """Yield parts of the frames with the ``(g, n, C)`` products of all waves and ``(G, K, C)`` modes."""
-        for part in _parts(len(whitened)):
-            yield part, self._back_projected(views.R[part], whitened[part] * self._gain[part, :, None])
+        parts, at_once = list(_parts(len(whitened))), processors()
+        for start in range(0, len(parts), at_once):
+            now = parts[start : start + at_once]
+            modes = (whitened[part] * self._gain[part, :, None] for part in now)
+            R = (views.R[part] for part in now)
+            yield from zip(now, in_parallel(self._back_projected, R, modes), strict=True)
 
     def _back_projected(self, R: Array, modes: ComplexArray) -> Array:
         """Return ``(g, n, C)`` sums ``Re Σ_k exp(i⟨R k, b⟩) modes`` of ``(g, K, C)`` modes, folded."""

@@ -152,9 +152,11 @@ def _told_apart(
 ) -> Fit:
     """Return the motion fitted to what a pattern of ``(P,)`` values leaves, told anew each time."""
     rounds, steps, settled = patience
-    for _ in range(rounds):
+    for left in reversed(range(rounds)):
         cleared = _like(model, views.without(points.waves @ values), points.band / views.low.radius)
         fit = cleared.fit(path, views.low.time, spline, steps=steps)
+        if not left:
+            break
         path, before = fit.path, values
         _, values = _pattern(views.shifted(fit.shift), path, points, model)
         change = np.linalg.norm(points.waves @ (values - before))
