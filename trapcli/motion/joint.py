@@ -159,8 +159,9 @@ class Found:
         (fit, _), time = self.best, self.stack.low.time
         stack = replace(self.stack, low=replace(self.stack.low, modes=self.stack.low.modes - pattern))
         low = _fine_groups(stack, self.pace)
-        start = (path or fit.path).ascending()
-        (coarse,) = _coarse_fits([start], low, time, fit.model.band, self.knots)
+        coarse = fit
+        if path is not None:
+            (coarse,) = _coarse_fits([path.ascending()], low, time, fit.model.band, self.knots)
         model = ObjectModel.likeliest(low, fit.model.band, coarse.R, sharp=fit.model.sharp)
         best = _fine_fit(coarse, model, smooth=not self.knots)
         stack, best = _quieter(stack, self.pace, *best)
