@@ -47,7 +47,7 @@ _MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
 _ROUNDS = 3  # of looking for more
 _NOTHING = 1e-30  # square of a spot that isn't there
 _MOST_AT_ONCE = 60  # candidates of a round
-_MOST = 0.4  # most that a speck may absorb, as a share of the whole attenuation
+_MOST = 0.4  # share of the whole attenuation that a speck may absorb, unless it clearly stays in place
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,7 @@ def _add(specks: list[Array], standing: Standing, place: Array, places: Array) -
     """Add a speck at `place`, one of several, and fit those near it again; tell whether there is one."""
     near = [k for k, speck in enumerate(specks) if np.hypot(*(speck[:2] - place)) < _TOGETHER]
     fitted = _fit(standing, place, specks, near, places)
-    whole = float(np.abs(standing.image).sum())
-    if fitted is None or np.abs(render([fitted[0]], standing.image.shape)).sum() > _MOST * whole:
+    if fitted is None:
         return False
     for k, speck in zip(near, fitted[1:], strict=True):
         specks[k] = speck
@@ -374,10 +373,11 @@ def _fit(
     series = series - window.profiles(found.x.reshape(-1, 4)[1:])[:, None]
     along = [_profile(*window.places, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
     here = window.profiles(found.x.reshape(-1, 4)[:1])[:, None]
-    return fitted if _stays(series, here, window.white(np.array(along).T)) else None
+    most = np.abs(render(fitted[:1], shape)).sum() > _MOST * np.abs(standing.image).sum()
+    return fitted if _stays(series, here, window.white(np.array(along).T), bool(most)) else None
 
 
-def _stays(series: Array, here: Array, along: Array) -> bool:
+def _stays(series: Array, here: Array, along: Array, most: bool) -> bool:
     """Tell whether a spot is always there and stays in place, rather than being carried by the particle.
 
     Parameters
@@ -386,10 +386,13 @@ def _stays(series: Array, here: Array, along: Array) -> bool:
         ``(P, K)`` frames.
     here, along:
         ``(P, 1)`` and ``(P, K)`` the spot in its place and as it would drift with the particle.
+    most:
+        Whether most of what absorbs would be that spot: it may be the particle itself.
     """
     shares = np.sum(here * series, axis=0) / np.sum(here**2)
     in_place = _in_place(series - shares.mean() * here, shares.mean() * (along - here))
-    return _clarity(shares) > next((least for bound, least in _STEADY if in_place > bound), np.inf)
+    steady = _STEADY[:1] if most else _STEADY
+    return _clarity(shares) > next((least for bound, least in steady if in_place > bound), np.inf)
 
 
 def _in_place(left: Array, carried: Array) -> float:
