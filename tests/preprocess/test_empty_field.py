@@ -215,6 +215,38 @@ def test_what_drifts_with_the_particle_is_no_speck() -> None:
     assert fit_empty_field(frames.astype(np.float32)).specks == 0
 
 
+@pytest.mark.parametrize(("share", "low", "high"), [(0.0, 10, 1e9), (0.5, -4, 4), (1.0, -1e9, -10)])
+def test_how_far_a_spot_follows_the_drift_tells_whether_it_stays(
+    share: float, low: float, high: float
+) -> None:
+    move = 2 * np.sin(np.arange(FRAMES) / 3)[:, None, None]
+
+    def spot(share: float) -> np.ndarray:
+        square = (ROWS - share * move) ** 2 + COLUMNS**2
+        return np.asarray(0.3 * np.exp(-square / (2 * 2.5**2))).reshape(FRAMES, -1).T
+
+    here = spot(0.0)[:, :1]
+    noise = 0.02 * np.random.default_rng(9).standard_normal((SIZE**2, FRAMES))
+    # to first order in the drift, which is what is compared
+    seen = here + share * (spot(1.0) - here) + noise
+    assert low < specks._in_place(seen - here, spot(1.0) - here) < high
+
+
+def test_a_dark_speck_before_a_weak_particle() -> None:
+    """Most of what absorbs is the speck; what drifts over it is the particle."""
+    dust = speck(2, -3, size=2.5, depth=0.9)
+    frames = np.zeros((FRAMES, SIZE, SIZE))
+    turn, move = np.linspace(0, 3 * np.pi, FRAMES), 5 * np.sin(np.arange(FRAMES) / 6)
+    for image, angle, down in zip(frames, turn, move, strict=True):
+        x1 = np.cos(angle) * COLUMNS + np.sin(angle) * (ROWS - down)
+        x2 = np.cos(angle) * (ROWS - down) - np.sin(angle) * COLUMNS
+        image[:] = 0.025 * np.sqrt(np.maximum(1 - (x1 / 22) ** 2 - (x2 / 17) ** 2, 0))
+    noise = NOISE * np.random.default_rng(7).standard_normal(frames.shape)
+    found = fit_empty_field((uneven() + dust - frames + noise).astype(np.float32))
+    assert np.abs(dust).sum() > specks._MOST * (np.abs(dust).sum() + frames.mean(axis=0).sum())
+    assert np.abs(deviation(found.log_light, uneven() + dust)).max() < 0.05 * np.abs(dust).max()
+
+
 def enlarged(image: np.ndarray, times: int) -> np.ndarray:
     """Return an image with `times` as many rows and columns, and one more of each."""
     return np.pad(np.kron(image, np.ones((times, times))), ((0, 1), (0, 1)), mode="edge")
