@@ -215,21 +215,33 @@ def test_what_drifts_with_the_particle_is_no_speck() -> None:
     assert fit_empty_field(frames.astype(np.float32)).specks == 0
 
 
+def following(share: float, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``(P, K)`` frames of a spot that follows a share of the drift, and the spot if it followed all.
+
+    To first order in the drift, which is what is compared.
+    """
+    move = 2 * np.sin(np.arange(FRAMES) / 3)[:, None, None]
+    spot = (0.3 * np.exp(-((ROWS - move) ** 2 + COLUMNS**2) / (2 * 2.5**2))).reshape(FRAMES, -1).T
+    here = spot[:, :1]  # the first frame's drift is none
+    noisy = noise * np.random.default_rng(9).standard_normal(spot.shape)
+    return here + share * (spot - here) + noisy, spot
+
+
 @pytest.mark.parametrize(("share", "low", "high"), [(0.0, 10, 1e9), (0.5, -4, 4), (1.0, -1e9, -10)])
 def test_how_far_a_spot_follows_the_drift_tells_whether_it_stays(
     share: float, low: float, high: float
 ) -> None:
-    move = 2 * np.sin(np.arange(FRAMES) / 3)[:, None, None]
+    seen, spot = following(share, noise=0.02)
+    assert low < specks._in_place(seen - spot[:, :1], spot - spot[:, :1]) < high
 
-    def spot(share: float) -> np.ndarray:
-        square = (ROWS - share * move) ** 2 + COLUMNS**2
-        return np.asarray(0.3 * np.exp(-square / (2 * 2.5**2))).reshape(FRAMES, -1).T
 
-    here = spot(0.0)[:, :1]
-    noise = 0.02 * np.random.default_rng(9).standard_normal((SIZE**2, FRAMES))
-    # to first order in the drift, which is what is compared
-    seen = here + share * (spot(1.0) - here) + noise
-    assert low < specks._in_place(seen - here, spot(1.0) - here) < high
+def test_what_may_be_the_particle_itself_must_stay_more_clearly() -> None:
+    seen, spot = following(0.3, noise=0.2)
+    assert 4 < specks._in_place(seen - spot[:, :1], spot - spot[:, :1]) < 7
+    assert specks._stays(seen, spot[:, :1], spot, most=False)
+    assert not specks._stays(seen, spot[:, :1], spot, most=True)
+    still, spot = following(0.0, noise=0.02)
+    assert specks._stays(still, spot[:, :1], spot, most=True)
 
 
 def test_a_dark_speck_before_a_weak_particle() -> None:

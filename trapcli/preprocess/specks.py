@@ -32,6 +32,9 @@ _STEADY = ((3.4, 12.0), (2.4, 40.0), (1.0, 60.0), (-1.0, 100.0))
 """Standard errors by which a speck is nearer to its place than to drifting with the particle, at least;
 those by which its depth must then stand out of how it varies between parts of the stack."""
 
+_STEADIEST = ((8.0, 40.0),)
+"""The same of a speck that would be most of what absorbs: it may be the particle itself."""
+
 _SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
 _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
 _DEEPEST = 0.98
@@ -387,12 +390,12 @@ def _stays(series: Array, here: Array, along: Array, most: bool) -> bool:
     here, along:
         ``(P, 1)`` and ``(P, K)`` the spot in its place and as it would drift with the particle.
     most:
-        Whether most of what absorbs would be that spot: it may be the particle itself.
+        Whether most of what absorbs would be that spot.
     """
     shares = np.sum(here * series, axis=0) / np.sum(here**2)
     in_place = _in_place(series - shares.mean() * here, shares.mean() * (along - here))
-    steady = _STEADY[:1] if most else _STEADY
-    return _clarity(shares) > next((least for bound, least in steady if in_place > bound), np.inf)
+    levels = _STEADIEST if most else _STEADY
+    return _clarity(shares) > next((least for bound, least in levels if in_place > bound), np.inf)
 
 
 def _in_place(left: Array, carried: Array) -> float:
