@@ -238,10 +238,10 @@ def test_how_far_a_spot_follows_the_drift_tells_whether_it_stays(
 def test_what_may_be_the_particle_itself_must_stay_more_clearly() -> None:
     seen, spot = following(0.3, noise=0.2)
     assert 4 < specks._in_place(seen - spot[:, :1], spot - spot[:, :1]) < 7
-    assert specks._stays(seen, spot[:, :1], spot, most=False)
-    assert not specks._stays(seen, spot[:, :1], spot, most=True)
+    assert specks._stays(seen, spot[:, :1], spot, share=0.1)
+    assert not specks._stays(seen, spot[:, :1], spot, share=0.9)
     still, spot = following(0.0, noise=0.02)
-    assert specks._stays(still, spot[:, :1], spot, most=True)
+    assert specks._stays(still, spot[:, :1], spot, share=0.9)
 
 
 def test_a_dark_speck_before_a_weak_particle() -> None:

@@ -33,7 +33,7 @@ _STEADY = ((3.4, 12.0), (2.4, 40.0), (1.0, 60.0), (-1.0, 100.0))
 those by which its depth must then stand out of how it varies between parts of the stack."""
 
 _STEADIEST = ((8.0, 40.0),)
-"""The same of a speck that would be most of what absorbs: it may be the particle itself."""
+"""The same of a speck that may be the particle itself."""
 
 _SIZES = (0.9, 1.7, 2.8)  # widths from which a fit starts [pixels]
 _LEAST_SIZE, _MOST_SIZE = 0.4, 5.0
@@ -50,7 +50,7 @@ _MOVES = 2.0  # farthest that a fit moves a candidate [pixels]
 _ROUNDS = 3  # of looking for more
 _NOTHING = 1e-30  # square of a spot that isn't there
 _MOST_AT_ONCE = 60  # candidates of a round
-_MOST = 0.4  # share of the whole attenuation that a speck may absorb, unless it clearly stays in place
+_MOST = 0.4  # share of what absorbs, and is no other speck, from which on one may be the particle itself
 
 
 @dataclass(frozen=True)
@@ -376,11 +376,12 @@ def _fit(
     series = series - window.profiles(found.x.reshape(-1, 4)[1:])[:, None]
     along = [_profile(*window.places, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
     here = window.profiles(found.x.reshape(-1, 4)[:1])[:, None]
-    most = np.abs(render(fitted[:1], shape)).sum() > _MOST * np.abs(standing.image).sum()
-    return fitted if _stays(series, here, window.white(np.array(along).T), bool(most)) else None
+    left = np.abs(standing.image - render(specks, shape)).sum()
+    share = float(np.abs(render(fitted[:1], shape)).sum() / (left + _NOTHING))
+    return fitted if _stays(series, here, window.white(np.array(along).T), share) else None
 
 
-def _stays(series: Array, here: Array, along: Array, most: bool) -> bool:
+def _stays(series: Array, here: Array, along: Array, share: float) -> bool:
     """Tell whether a spot is always there and stays in place, rather than being carried by the particle.
 
     Parameters
@@ -389,12 +390,12 @@ def _stays(series: Array, here: Array, along: Array, most: bool) -> bool:
         ``(P, K)`` frames.
     here, along:
         ``(P, 1)`` and ``(P, K)`` the spot in its place and as it would drift with the particle.
-    most:
-        Whether most of what absorbs would be that spot.
+    share:
+        Of what absorbs and is no other speck that would be that spot.
     """
     shares = np.sum(here * series, axis=0) / np.sum(here**2)
     in_place = _in_place(series - shares.mean() * here, shares.mean() * (along - here))
-    levels = _STEADIEST if most else _STEADY
+    levels = _STEADIEST if share > _MOST else _STEADY
     return _clarity(shares) > next((least for bound, least in levels if in_place > bound), np.inf)
 
 
