@@ -190,6 +190,9 @@ class _Rivals:
             own_cost, own_degrees = self._own[i]
             free = max(abs(own_degrees - degrees), parameters)
             allowed = free + _SIGNIFICANT * float(np.sqrt(2 * free)) + _MODEL_ERROR * own_cost
+            if model is not self._models[-1]:
+                # what a coarser model leaves over of the fitted motion itself is no reason against another
+                allowed += max(own_cost - own_degrees, 0.0)
             if cost - degrees > own_cost - own_degrees + allowed:
                 return False
         return True
