@@ -500,6 +500,24 @@ def test_an_interrupted_run_leaves_nothing_behind(stack: Path, jobs: str, number
         assert Motion.load(name).identifiable
 
 
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="signals")
+def test_an_interrupt_is_heeded_where_exceptions_are_ignored() -> None:
+    program = (
+        "import os, signal, time, weakref\n"
+        "from trapcli.cli.workers import _heed_interrupts\n"
+        "_heed_interrupts()\n"
+        "class Thing: pass\n"
+        "thing = Thing()\n"
+        "reference = weakref.ref(thing, lambda _: (os.kill(os.getpid(), signal.SIGTERM), time.sleep(0.1)))\n"
+        "try:\n"
+        "    del thing\n"
+        "    time.sleep(20)\n"
+        "except KeyboardInterrupt: print('interrupted')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("interrupted\n", "")
+
+
 def test_progress_is_drawn_on_a_terminal_only(
     stack: Path, estimate: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -25,6 +26,8 @@ from trapcli.errors import ConfigError
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?[\w.\-\[\]:%]+:\d+")
 _PATIENCE = 10
 """Seconds in which a scheduler must answer."""
+_AGAIN = 0.01
+"""Seconds after which an interrupt that was ignored comes again."""
 
 
 class LostWorkerError(Exception):
@@ -140,13 +143,29 @@ class _Processes:
                 process.terminate()
 
 
-def _serve(connection: Connection, threads: int) -> None:
+def _heed_interrupts() -> None:
+    """Make SIGTERM a `KeyboardInterrupt`, also where Python ignores exceptions."""
+
     def interrupt(_signal: int, _frame: object) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # once is enough
         raise KeyboardInterrupt
 
+    def again(ignored: sys.UnraisableHookArgs) -> None:
+        # in a finalizer or the callback of a weak reference the interrupt would be lost
+        if ignored.exc_type is KeyboardInterrupt and hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+        else:
+            sys.__unraisablehook__(ignored)
+
+    signal.signal(signal.SIGTERM, interrupt)
+    if hasattr(signal, "SIGALRM"):
+        signal.signal(signal.SIGALRM, interrupt)
+    sys.unraisablehook = again
+
+
+def _serve(connection: Connection, threads: int) -> None:
     try:
-        signal.signal(signal.SIGTERM, interrupt)
+        _heed_interrupts()
         # read when the numerical libraries are loaded, by `work`
         os.environ.setdefault("OMP_NUM_THREADS", str(threads))
         while True:
