@@ -152,15 +152,15 @@ def _heed_interrupts() -> None:
 
     def again(ignored: sys.UnraisableHookArgs) -> None:
         # in a finalizer or the callback of a weak reference the interrupt would be lost
-        if ignored.exc_type is KeyboardInterrupt and hasattr(signal, "setitimer"):
+        if ignored.exc_type is KeyboardInterrupt:
             signal.setitimer(signal.ITIMER_REAL, _AGAIN)
         else:
             sys.__unraisablehook__(ignored)
 
     signal.signal(signal.SIGTERM, interrupt)
-    if hasattr(signal, "SIGALRM"):
+    if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, interrupt)
-    sys.unraisablehook = again
+        sys.unraisablehook = again
 
 
 def _serve(connection: Connection, threads: int) -> None:

@@ -376,7 +376,7 @@ def _fit(
     series = series - window.profiles(found.x.reshape(-1, 4)[1:])[:, None]
     along = [_profile(*window.places, *(fitted[0] + [*move, 0, 0])) for move in standing.drift]
     here = window.profiles(found.x.reshape(-1, 4)[:1])[:, None]
-    left = np.abs(standing.image - render(specks, shape)).sum()
+    left = np.abs(standing.image - others - render(known, shape)).sum()
     share = float(np.abs(render(fitted[:1], shape)).sum() / (left + _NOTHING))
     return fitted if _stays(series, here, window.white(np.array(along).T), share) else None
 
